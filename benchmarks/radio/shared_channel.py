@@ -4,8 +4,9 @@
     python benchmarks/radio/shared_channel.py RUN [--agents 20] [--rate 500] [--loss 0.2] [--silence 60] [--late]
         [--restart]
 
-RUN: the folder of a run with its ``map``. Every agent replays its submaps, agent k beginning k seconds later, by the
-uplink, downlink, outbox and inbox of the node; there is no Zenoh in it. All share ``--rate`` kbit/s, first come first
+RUN: the folder of a run with its ``map``. Every agent replays the submaps of its first agent, or, where the run has as
+many agents as there are here, those of its own, agent k beginning k seconds later, by the uplink, downlink, outbox and
+inbox of the node; there is no Zenoh in it. All share ``--rate`` kbit/s, first come first
 served, both directions together; a message has the 150 bytes of headers that the budget counts. ``--loss``: share of
 messages lost. ``--silence``: nothing comes through between the post and one agent for so long, then it is the next
 one's turn; agents repeat the run until all have had theirs. ``--late``: the last agent begins at minute 10.
@@ -77,12 +78,20 @@ def main() -> None:
     parser.add_argument("--restart", action="store_true")
     arguments = parser.parse_args()
     submaps = [r.submap for r in storage.read(arguments.run / "map").state.graph.records]
-    submaps = [s for s in submaps if (s.agent, s.session) == (submaps[0].agent, submaps[0].session)]
     with tempfile.TemporaryDirectory() as folder:
-        replay(submaps, arguments, Path(folder))
+        replay(of_agents(submaps, arguments.agents), arguments, Path(folder))
 
 
-def replay(submaps: list[Submap], arguments: argparse.Namespace, folder: Path) -> None:
+def of_agents(submaps: list[Submap], count: int) -> list[list[Submap]]:
+    """Submaps of each of ``count`` agents: those of the run's own agents if it has so many, else of its first."""
+    found: dict[tuple[str, int], list[Submap]] = {}
+    for submap in submaps:
+        found.setdefault((submap.agent, submap.session), []).append(submap)
+    walks = list(found.values())
+    return walks[:count] if len(walks) >= count else [walks[0]] * count
+
+
+def replay(walks: list[list[Submap]], arguments: argparse.Namespace, folder: Path) -> None:
     """Run the agents until all has arrived, or for three minutes after the last submap."""
     names = [f"agent_{k}" for k in range(arguments.agents)]
     rate = 125.0 * arguments.rate
@@ -94,11 +103,11 @@ def replay(submaps: list[Submap], arguments: argparse.Namespace, folder: Path) -
     inboxes = [Inbox(n, folder / "in" / n) for n in names]
     downlink = Downlink(inboxes, rate / 5.0)
     silences = {n: arguments.silence * np.array([k + 1, k + 2]) for k, n in enumerate(names)}
-    submaps, ends = repeated(submaps, arguments.silence * (len(names) + 2))
-    keys = {(s.session, s.index) for s in submaps}
-    due = sorted((begins[n] + end, n, k) for n in names for k, end in enumerate(ends))
+    plans = {n: repeated(w, arguments.silence * (len(names) + 2)) for n, w in zip(names, walks, strict=True)}
+    keys = {(n, (s.session, s.index)) for n, (submaps, _) in plans.items() for s in submaps}
+    due = sorted((begins[n] + end, n, k) for n in names for k, end in enumerate(plans[n][1]))
     count, last_s, middle_s = len(due), due[-1][0], 0.5 * due[-1][0]
-    ended = {(n, (submaps[k].session, submaps[k].index)): at for at, n, k in due}
+    ended = {(n, (plans[n][0][k].session, plans[n][0][k].index)): at for at, n, k in due}
     took: dict[tuple[str, object], float] = {}
     now, joined_s = 0.0, 0.0
     while now < last_s + _AFTER_S and (due or len(took) < count):
@@ -113,7 +122,8 @@ def replay(submaps: list[Submap], arguments: argparse.Namespace, folder: Path) -
                 inbox.release()
         while due and due[0][0] <= now:
             at, name, k = due.pop(0)
-            uplinks[name].add_submap((submaps[k].session, submaps[k].index), pack(replace(submaps[k], agent=name)), now)
+            submap = plans[name][0][k]
+            uplinks[name].add_submap((submap.session, submap.index), pack(replace(submap, agent=name)), now)
         for name, uplink in uplinks.items():
             if now < begins[name]:
                 continue
@@ -135,9 +145,9 @@ def replay(submaps: list[Submap], arguments: argparse.Namespace, folder: Path) -
                 if (name, key) not in took:
                     took[name, key] = at - ended[name, key]  # type: ignore[index]
                     joined_s = at
-    way = len(names) * sum(float(np.linalg.norm(s.end_pose[:3, 3])) for s in submaps)
+    way = sum(float(np.linalg.norm(s.end_pose[:3, 3])) for submaps, _ in plans.values() for s in submaps)
     waits = np.array(list(took.values()))
-    held = sum(key in keys for _, key in took)
+    held = sum(key in keys for key in took)
     print(f"{held} of {count} submaps, 50 % {np.median(waits):.1f} s, 95 % {np.percentile(waits, 95):.1f} s, "
           f"most {waits.max():.1f} s, {channel.sent / way / 1e3:.1f} kB/m, channel used "
           f"{100 * channel.sent / rate / now:.0f} %, the last {joined_s - last_s:.1f} s after its end")  # fmt: skip
