@@ -55,6 +55,7 @@ def rig_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def test_no_frame_is_lost_where_one_camera_sees_a_blank_wall(back_to_back: Path, rig_files: dict[str, Path]) -> None:
     summary = summarise(mapped(back_to_back))
+    assert summary["frames"] == FRAMES
     assert summary["lost_share"] == {"": 0.0}
     assert summary["sensors"][""][0] == "2 cameras (back, front)"
     assert summary["ate_rmse_m"] < 0.02

@@ -195,6 +195,18 @@ def test_swapped_images_are_named_as_such(stereo_pair):
         frontend().process(swapped)
 
 
+def test_a_camera_that_has_been_right_is_not_swapped_where_noise_matches_by_chance(stereo_pair, monkeypatch):
+    pair = stereo_pair()
+    seeing = frontend()
+    monkeypatch.setattr("stereo_frontend.stereo_depth.swapped_share", lambda *_: (0.62, 58))
+    blank = np.random.default_rng(3).normal(128.0, 20.0, (2, *pair.left.shape)).clip(0, 255).astype(np.uint8)
+    wall = dataclasses.replace(pair, stamp_ns=pair.stamp_ns + 1, left=blank[0], right=blank[1])
+    with pytest.raises(ValueError, match="swapped"):
+        frontend().process(wall)
+    seeing.process(pair)
+    seeing.process(wall)
+
+
 @pytest.mark.parametrize("grey", [0, 255])
 @pytest.mark.parametrize("mode", ["stereo", "fuse"])
 def test_black_and_white_frames_give_no_features(stereo_pair, grey, mode):

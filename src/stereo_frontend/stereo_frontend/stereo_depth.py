@@ -48,6 +48,7 @@ class StereoDepth:
         self.calibration = StereoSelfCalibration(config.self_calibration)
         self.clock = PairClock(config.pair, tracks=config.tracks)
         self._poor_pairs = 0
+        self._has_been_right = False
         self._wide = self.calibration.widened(config.matching)
 
     def reset(self) -> None:
@@ -56,6 +57,7 @@ class StereoDepth:
         self.calibration.reset()
         self.clock.reset()
         self._poor_pairs = 0
+        self._has_been_right = False
 
     def learn(self, images: StereoImages, left: Keypoints, refined: RefinedDisparity) -> None:
         """Learn the rectification's error from left keypoints (n), described, and their disparities (n)."""
@@ -72,7 +74,10 @@ class StereoDepth:
         partner = right.uv[matches.right]
         partner = partner - self.clock.shift(images.stereo, partner, found.uv[:, 0] - partner[:, 0]).uv
         disparity, sigma, refined = self._disparities(images, found.uv, partner, found.size)
-        if refined.valid.sum() < _FEW_TRUSTED * len(left):
+        trusted = int(refined.valid.sum())
+        if trusted >= _FEW_TRUSTED * len(left):
+            self._has_been_right |= trusted >= _SWAPPED_MATCHES
+        elif not self._has_been_right:  # later on it is a blank wall, whose noise matches by chance
             self._reject_swapped(left, right, bounds)
         estimate = DepthEstimate.unknown(len(left))
         estimate.depth[matches.left] = images.stereo.depth_from_disparity(disparity)
