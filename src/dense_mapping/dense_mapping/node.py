@@ -79,6 +79,9 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         self.mapper = DenseStage(self.config)
         # Each camera is to the model what an agent with one camera is, on the path of its rig.
         self._cameras = {a: [below(a, c) for c in self.config.cameras] or [a] for a in self.config.agents}
+        self._bases = {
+            camera: below(agent, self.config.base_frame) for agent, own in self._cameras.items() for camera in own
+        }
         self._pairs = {camera: StereoStage(rectified=True) for own in self._cameras.values() for camera in own}
         self._corrections: dict[str, str] = {}
         self._stamp_ns = 0
@@ -135,7 +138,7 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         if self.config.use_tof:
             topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
             topics = {own(topic): kind for topic, kind in topics.items()}
-            listen_together(topics, partial(self._on_depth, agent, camera), required=False)
+            listen_together(topics, partial(self._on_depth, camera), required=False)
             listen(own("tof/color/image"), "Image", partial(self._on_colour, camera, "tof"), required=False)
             masks = partial(self._on_mask, camera, "tof")
             listen(own("tof/mask"), "Image", masks, required=False, stamps=StampPolicy.FOLLOWS)
@@ -144,7 +147,7 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
                 topic = own(f"stereo/{side}/camera_info")
                 listen(topic, "CameraInfo", partial(self._on_info, camera, side), required=False)
             pairs = {own(f"stereo/{side}/image_rect"): "Image" for side in SIDES}
-            listen_together(pairs, partial(self._on_pair, agent, camera), required=False)
+            listen_together(pairs, partial(self._on_pair, camera), required=False)
             masks = partial(self._on_mask, camera, "stereo")
             listen(own("mask"), "Image", masks, required=False, stamps=StampPolicy.FOLLOWS)
             colours = own("stereo/left/image_rect_color")
@@ -158,8 +161,8 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         if self._current[agent].update(self._plans, pose_from_message(message.pose.pose)[:3, 3]):
             self._publish_storey(agent)
 
-    def _on_depth(self, agent: str, camera: str, depth: Message, noise: Message, info: Message) -> None:
-        T_base_camera = self.lookup(below(agent, self.config.base_frame), depth.header.frame_id)
+    def _on_depth(self, camera: str, depth: Message, noise: Message, info: Message) -> None:
+        T_base_camera = self.lookup(self._bases[camera], depth.header.frame_id)
         if self.mapper.wants(camera, "tof", stamp_ns(depth), T_base_camera):
             self.mapper.add(camera, "tof", T_base_camera, depth_from_messages(depth, noise, info), NO_PICTURE)
 
@@ -177,8 +180,8 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
     def _on_info(self, camera: str, side: str, message: Message) -> None:
         self._pairs[camera].set_info(side, camera_info_from_message(message))
 
-    def _on_pair(self, agent: str, camera: str, left: Message, right: Message) -> None:
-        T_base_camera = self.lookup(below(agent, self.config.base_frame), left.header.frame_id)
+    def _on_pair(self, camera: str, left: Message, right: Message) -> None:
+        T_base_camera = self.lookup(self._bases[camera], left.header.frame_id)
         grey, colour = grey_and_colour_from_message(left)
         pair = RawPair(stamp_ns(left), grey, grey_from_message(right), left.header.frame_id, colour)
         self.mapper.add_pair(camera, T_base_camera, pair, self._pairs[camera])
