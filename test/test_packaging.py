@@ -158,7 +158,7 @@ def test_scenarios_bounds_and_demo_bag_are_installed(installed):
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (("simulate", "nonsense", "-o", "bag"), 2, "known: conference, corridor_with_positions, demo"),
+        (("simulate", "nonsense", "-o", "bag"), 2, "known: back_to_back, conference, corridor_with_positions"),
         (("simulate", "demo", "-o", "/proc/bag", "--frames", "1"), 2, "No such file or directory"),
         (("experiment", "planar", "--quick", "-o", "page"), 0, "written to"),
         (("demo", "--help"), 0, "--view"),

@@ -83,14 +83,14 @@ def eliminate_piece(piece: Piece, state: JoiningState, damping: float) -> Elimin
 
 
 def reduce_piece(piece: Piece, state: JoiningState, damping: float) -> Reduced:
-    """The same, but only what is left for the parent."""
+    """Eliminate a region and all inside it; only what is left for the parent is returned."""
     return eliminate_piece(piece, state, damping).reduced
 
 
 def eliminated_again(
     inside: Callable[..., FloatArray], piece: Piece, state: JoiningState, damping: float, separator: FloatArray
 ) -> FloatArray:
-    """What ``inside`` makes of a piece, eliminated once more."""
+    """Result of ``inside`` for a piece that is eliminated once more."""
     return inside(piece, eliminate_piece(piece, state, damping), separator)
 
 
