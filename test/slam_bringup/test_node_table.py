@@ -13,10 +13,10 @@ from slam_bringup.pipeline.node_table import NODES, NodeDeclaration
 from slam_core.config import Config
 
 EVERY_SENSOR = {
-    "feature_extractor": ("mode:=fuse",),
-    "radio_link": ("role:=agent", "agents:=['anna']", "connect:=['tcp/127.0.0.1:1']"),
+    "feature_extractor": [("mode:=fuse",)],
+    "radio_link": [(f"role:={role}", "agents:=['anna']", "connect:=['tcp/127.0.0.1:1']") for role in ("agent", "post")],
 }
-"""Parameters with which a node has all its topics."""
+"""Parameters with which a node has all its topics, some here and some there."""
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -48,17 +48,20 @@ def test_the_classes_of_every_node_can_be_loaded(declared: NodeDeclaration) -> N
 @pytest.mark.parametrize("declared", [d for d in NODES if not d.is_tool], ids=lambda d: d.executable)
 def test_every_node_has_the_topics_that_are_declared(declared: NodeDeclaration) -> None:
     rclpy = pytest.importorskip("rclpy")
-    given = [text for p in EVERY_SENSOR.get(declared.executable, ()) for text in ("-p", p)]
-    rclpy.init(args=["--ros-args", *given] if given else [])
-    node = None
-    try:
-        node = declared.load_node_class()()
-        found = {s.topic_name.strip("/") for s in (*node.subscriptions, *node.publishers)}
-    finally:
-        if node is not None:
-            node.on_close()
-            node.destroy_node()
-        rclpy.try_shutdown()
+    found: set[str] = set()
+    for parameters in EVERY_SENSOR.get(declared.executable, [()]):
+        given = [text for p in parameters for text in ("-p", p)]
+        rclpy.init(args=["--ros-args", *given] if given else [])
+        node = None
+        try:
+            node = declared.load_node_class()()
+            topics = (s.topic_name.strip("/") for s in (*node.subscriptions, *node.publishers))
+            found |= {topic.removeprefix("anna/") for topic in topics}
+        finally:
+            if node is not None:
+                node.on_close()
+                node.destroy_node()
+            rclpy.try_shutdown()
     assert expanded((*declared.inputs, *declared.outputs)) - found == set()
 
 

@@ -79,8 +79,8 @@ NODES = (
     NodeDeclaration(
         "slam_radio", "radio_link", "slam_radio.radio_link_node", "RadioLinkNode",
         "slam_radio.radio_config:RadioConfig",
-        inputs=(*_SUBMAP, "odom", *_RECTIFIED, *_DEPTH, "tof/color/image", "map/path", "wanted_picture",
-                "wanted_key_frame"),
+        inputs=(*_SUBMAP, "odom", "stereo/left/image_rect", "stereo/left/image_rect_color", "stereo/left/camera_info",
+                *_DEPTH, "tof/color/image", "map/path", "wanted_picture", "wanted_key_frame"),
         outputs=("map_to_odom", *_KEY_FRAME, "view/picture/compressed", "view/pose"),
     ),
     NodeDeclaration(
