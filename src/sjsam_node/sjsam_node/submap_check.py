@@ -27,6 +27,6 @@ def fault_of(submap: Submap) -> str:
         return f"variances below {SMALLEST_VARIANCE:g}, less than any sensor's"
     if not is_rigid_transform(submap.end_pose):
         return "end pose is not a rigid transform"
-    if not blas.cholesky(np.array(submap.covariance.T, np.float64, order="F")):
+    if not blas.cholesky(np.array(submap.covariance, np.float64, order="F")):
         return "covariance is not positive definite"
     return ""

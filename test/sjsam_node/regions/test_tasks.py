@@ -9,6 +9,7 @@ import socket
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
@@ -137,6 +138,40 @@ def test_a_cluster_that_is_there_again_is_given_at_once_all_that_is_still_asked_
     assert tasks.gather(handles[1:2]) == ["b"]
     assert second.given == ["b", "c"]
     assert tasks.gather(handles) == ["a", "b", "c"]
+
+
+def test_the_cluster_drops_what_nobody_can_ask_for_and_makes_it_again_where_it_is_needed():
+    pytest.importorskip("distributed")
+
+    class Future:
+        """What a client gives, which drops its result when the last reference ends."""
+
+        def __init__(self, function, arguments):
+            self.value = function(*(a.value if isinstance(a, Future) else a for a in arguments))
+
+    class Client(OfOneProcess):
+        def submit(self, function, *arguments, pure):
+            self._check()
+            self.given.append(function)
+            future = Future(function, arguments)
+            self.alive.add(future)
+            return future
+
+        def gather(self, futures):
+            self._check()
+            return [future.value for future in futures]
+
+    first, second = Client(), Client()
+    first.alive, second.alive = weakref.WeakSet(), weakref.WeakSet()
+    tasks = OnCluster(first, lambda: second)
+    base = tasks.submit(int, "7")
+    above = tasks.submit(str, base)
+    assert len(first.alive) == 2
+    del base
+    assert len(first.alive) == 1
+    first.is_lost = True
+    assert tasks.gather([above]) == ["7"]
+    assert second.given == [int, str]
 
 
 def test_a_cluster_that_does_not_come_back_is_waited_for_once():

@@ -92,8 +92,8 @@ class NotAvailable(ValueError):
 class _Task:
     """A function and its arguments, other tasks among them; kept so that it can be given to a cluster once more.
 
-    number: in the order in which they were submitted; future: of the result, on the cluster of ``client``;
-    is_asked_for: nobody has been given the result yet.
+    number: in the order in which they were submitted; future: of the result, on the cluster of ``client``, until nobody
+    can ask for it any more; is_asked_for: somebody can, who has not been given the result yet.
     """
 
     function: Callable[..., Any]
@@ -102,6 +102,17 @@ class _Task:
     future: Any = None
     client: Any = None
     is_asked_for: bool = True
+
+    def let_go(self) -> None:
+        """Let the cluster drop the result; tasks that need it have it there."""
+        self.future, self.is_asked_for = None, False
+
+
+@dataclass(frozen=True, eq=False)
+class _Handle:
+    """What asks for the result of a task, which the cluster keeps as long."""
+
+    task: _Task
 
 
 class OnCluster:
@@ -130,10 +141,13 @@ class OnCluster:
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """A handle of the result of a function."""
-        task = _Task(function, arguments, next(self._number))
+        own = tuple(a.task if isinstance(a, _Handle) else a for a in arguments)
+        task = _Task(function, own, next(self._number))
         self._surviving(lambda: self._future(task))
         self._tasks.add(task)
-        return task
+        handle = _Handle(task)
+        weakref.finalize(handle, task.let_go).atexit = False
+        return handle
 
     def gather(self, handles: Sequence[Any]) -> list[Any]:
         """The results, once all are there.
@@ -147,9 +161,9 @@ class OnCluster:
         TimeoutError
             If results were not there in time.
         """
-        results = self._surviving(lambda: self._results([self._future(task) for task in handles]))
-        for task in handles:
-            task.is_asked_for = False
+        results = self._surviving(lambda: self._results([self._future(handle.task) for handle in handles]))
+        for handle in handles:
+            handle.task.is_asked_for = False
         return results
 
     def channel(self, handler: Callable[[Any], None]) -> Callable[[Any], None]:
