@@ -8,6 +8,7 @@ import inspect
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,6 +80,38 @@ def test_a_list_that_fits_no_longer_is_told_apart(tmp_path: Path, monkeypatch: p
     sys.modules.pop("some_kernels", None)
     assert listed._compile_module(("some_kernels", {"doubled": [["int64"]]}))
     assert not listed._compile_module(("some_kernels", calls))
+
+
+def test_a_process_that_is_killed_leaves_the_kernels_to_their_first_call(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "deadly_kernels.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert not listed.compile_listed(lambda: None, {"deadly_kernels": {"none": [["int64"]]}})
+
+
+def test_ctrl_c_ends_all_processes_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "slow_kernels.py").write_text("import time\ntime.sleep(60)\n")
+    (tmp_path / "quick_kernels.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(listed.os, "sched_getaffinity", lambda _: {0, 1})
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        listed.compile_listed(interrupt, {"quick_kernels": {}, "slow_kernels": {"none": [["int64"]]}})
+    assert time.monotonic() - began < 30
+
+
+def test_memory_left_is_that_of_the_system_or_of_the_container(tmp_path: Path) -> None:
+    (tmp_path / "meminfo").write_text("MemTotal: 9 kB\nMemFree: 1 kB\nMemAvailable: 5 kB\n")
+    assert listed._memory_left(tmp_path / "meminfo", tmp_path) == 5 * 1024
+    (tmp_path / "memory.max").write_text("max\n")
+    (tmp_path / "memory.current").write_text("1000\n")
+    assert listed._memory_left(tmp_path / "meminfo", tmp_path) == 5 * 1024
+    (tmp_path / "memory.max").write_text("3000\n")
+    assert listed._memory_left(tmp_path / "meminfo", tmp_path) == 2000
+    assert listed._memory_left(tmp_path / "none", tmp_path / "none") == float("inf")
 
 
 def test_every_listed_kernel_takes_as_many_arguments() -> None:

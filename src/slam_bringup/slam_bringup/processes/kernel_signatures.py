@@ -11,10 +11,13 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -42,16 +45,39 @@ Calls = dict[str, dict[str, list[list[Any]]]]
 def compile_listed(on_module: Callable[[], None], calls: Calls) -> bool:
     """Compile ``calls`` in as many processes as there are processors and room; ``on_module`` is called after each.
 
-    Returns whether all of them fit the kernels as they are.
+    Returns whether all of them fit the kernels as they are; False too where a process was killed.
     """
-    pages, processors = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"), os.cpu_count() or 1
-    count = max(1, min(processors, len(calls), int(pages / _PROCESS_BYTES)))
-    with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
-        fits = True
-        for fit in pool.map(_compile_module, calls.items()):
-            on_module()
-            fits = fits and fit
+    count = max(1, int(min(len(os.sched_getaffinity(0)), len(calls), _memory_left() / _PROCESS_BYTES)))
+    fits = True
+    with ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_ignore_interrupt) as pool:
+        try:
+            for fit in pool.map(_compile_module, calls.items()):
+                on_module()
+                fits = fits and fit
+        except BrokenProcessPool:  # most likely for want of memory
+            return False
+        except KeyboardInterrupt:
+            for child in active_children():
+                child.terminate()
+            raise
     return fits
+
+
+def _ignore_interrupt() -> None:
+    """Leave Ctrl-C to the process that started this one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _memory_left(meminfo: Path = Path("/proc/meminfo"), group: Path = Path("/sys/fs/cgroup")) -> float:
+    """Bytes that processes can still take here, by the system and by the limit of a container (cgroup v2)."""
+    left = float("inf")
+    with suppress(OSError, StopIteration):
+        line = next(one for one in meminfo.read_text().splitlines() if one.startswith("MemAvailable:"))
+        left = 1024.0 * float(line.split()[1])
+    with suppress(OSError, ValueError):  # no group, or one without a limit
+        limit, used = ((group / name).read_text() for name in ("memory.max", "memory.current"))
+        left = min(left, float(int(limit) - int(used)))
+    return left
 
 
 def _compile_module(calls: tuple[str, dict[str, list[list[Any]]]]) -> bool:
