@@ -33,6 +33,9 @@ def test_every_scenario_of_the_thesis_has_bounds():
         "tagged_corridor_2",
         "untriggered_pair",
         "corridor_with_positions",
+        "lift",
+        "stairs",
+        "back_to_back",
     }
 
 

@@ -61,7 +61,7 @@ def test_the_new_storey_is_at_its_height_and_not_the_old_one(lift: Path, tmp_pat
 def test_the_nodes_ride_as_well(domain_environment: dict[str, str], lift: Path, tmp_path: Path) -> None:
     own = config(tmp_path)
     run = run_nodes(lift, own, tmp_path / "nodes", odometry=False, composed=True, names=BagNames())
-    ((first_ns, last_ns),) = Recording(run.recording).of_agent("").rides
+    ((first_ns, last_ns),) = Recording(run.recording).of_agent("", "").rides
     assert 8.0 < 1e-9 * (last_ns - first_ns) < 12.0
     online, _ = collect(lift, own, run, mapper="sjsam", odometry="none", names=BagNames())
     height, sigma = risen(online)

@@ -23,8 +23,8 @@ from submap_world import Agent, circle, ring_world  # noqa: E402
 
 from node_process import begin_node, end_node, free_port, private_probe  # noqa: E402
 from ros_probe import Probe  # noqa: E402
-from sjsam_node import storage  # noqa: E402
 from sjsam_node.agents import in_order  # noqa: E402
+from sjsam_node.map_file import storage  # noqa: E402
 from sjsam_node.node_config import SjsamNodeConfig  # noqa: E402
 from sjsam_node.session.map_session import MapSession  # noqa: E402
 from slam_bringup.pipeline.configuration import SystemConfig  # noqa: E402

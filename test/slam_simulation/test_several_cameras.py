@@ -48,7 +48,7 @@ def test_a_camera_turned_round_sees_what_the_turned_rig_sees(scenario: Scenario)
         def pose(self, t: float) -> np.ndarray:
             return one.path.pose(t) @ R
 
-    other.path = TurnedPath()
+    other.path = other._seen = TurnedPath()
     a, b = next(one.run(1)).left, next(other.run(1)).left
     assert a is not None
     assert b is not None
