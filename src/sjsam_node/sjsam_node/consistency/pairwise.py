@@ -88,13 +88,19 @@ class PairwiseConsistency:
         if not others:
             return np.empty(0, dtype=bool)
         out = np.zeros(len(others), dtype=bool)
-        for links in (others, [k.inverted() for k in others]):
-            ends = np.array([k.ends for k in links])
-            before, path_length = graph.odometry_between(np.full(len(links), one.first), ends[:, 0])
-            after, way_back = graph.odometry_between(ends[:, 1], np.full(len(links), one.second))
-            T = before @ np.array([k.T for k in links]) @ after
+        ends = np.array([k.ends for k in others])
+        from_one, to_one = np.full(len(others), one.first), np.full(len(others), one.second)
+        for is_inverted in (False, True):
+            before, path_length = graph.odometry_between(from_one, ends[:, int(is_inverted)])
+            after, way_back = graph.odometry_between(ends[:, 1 - int(is_inverted)], to_one)
+            same_ways = np.flatnonzero(np.isfinite(before[:, 0, 0]) & np.isfinite(after[:, 0, 0]))
+            if not len(same_ways):
+                continue
+            links = [others[k].inverted() if is_inverted else others[k] for k in same_ways.tolist()]
+            T = before[same_ways] @ np.array([k.T for k in links]) @ after[same_ways]
             covariance = one.covariance + np.array([k.covariance for k in links])
-            out |= self._are_off(T, np.broadcast_to(one.T, T.shape), covariance, path_length + way_back)
+            way = (path_length + way_back)[same_ways]
+            out[same_ways] |= self._are_off(T, np.broadcast_to(one.T, T.shape), covariance, way)
         return out
 
     def _are_off(
