@@ -13,6 +13,7 @@ from slam_core.types import PoseEstimate, Submap
 from slam_radio.downlink import Downlink
 from slam_radio.packing.light_submap import LightConfig, pack
 from slam_radio.queues.byte_budget import OVERHEAD
+from slam_radio.queues.detail_sender import DetailSender
 from slam_radio.queues.detail_store import DetailStore
 from slam_radio.queues.inbox import Inbox
 from slam_radio.queues.outbox import Outbox
@@ -57,9 +58,9 @@ class World:
     def start_agent(self) -> None:
         if hasattr(self, "uplink"):
             self.uplink.outbox.close()
-            self.uplink.details.folder.close()
+            self.uplink.details.store.close()
             self.uplink.views.files.close()
-        details = DetailStore(self.folder / "details", self.bytes_per_second)
+        details = DetailSender(DetailStore(self.folder / "details"), self.bytes_per_second)
         views = ViewSender(ViewFiles(self.folder / "shots", 1e6), self.bytes_per_second)
         self.uplink = Uplink(Outbox(self.folder / "out"), self.bytes_per_second, details=details, views=views)
 
@@ -77,7 +78,7 @@ class World:
         submap = self.whole(index)
         message = pack(submap, SIZE)
         if self.uplink.details is not None:
-            self.uplink.details.keep((2, index), submap, message)
+            self.uplink.details.store.keep((2, index), submap, message)
         self.uplink.add_submap((2, index), message, self.now_s)
 
     def whole(self, index: int) -> Submap:

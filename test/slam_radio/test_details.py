@@ -200,7 +200,7 @@ def test_a_landmark_that_cannot_be_sent_costs_the_details_and_not_the_submap(wor
     covariance = submap.covariance.copy()
     own = slice(6 + 3 * left_out, 9 + 3 * left_out)
     covariance[own, own] += 1e12 * np.eye(3)
-    world.uplink.details.keep((2, 0), replace(submap, covariance=covariance), pack(submap, SIZE))
+    world.uplink.details.store.keep((2, 0), replace(submap, covariance=covariance), pack(submap, SIZE))
     world.uplink.add_submap((2, 0), pack(submap, SIZE), world.now_s)
     world.submap(1)
     world.run(10.0)
@@ -209,7 +209,7 @@ def test_a_landmark_that_cannot_be_sent_costs_the_details_and_not_the_submap(wor
     assert world.passed_on == [0, 1]
     assert world.detail_keys == [1]
     assert world.told_none == [1]
-    assert world.uplink.details.damaged == 1
+    assert world.uplink.details.store.damaged == 1
 
 
 def test_details_that_there_are_not_are_answered_once_and_not_asked_for_again(world):
@@ -218,8 +218,8 @@ def test_details_that_there_are_not_are_answered_once_and_not_asked_for_again(wo
     for index in range(4):
         world.submap(index)
     world.run(20.0)
-    world.uplink.details.whole.remove((2, 1))
-    (world.uplink.details.whole.path / "2-2.npz").write_bytes(b"PK damaged")
+    world.uplink.details.store.whole.remove((2, 1))
+    (world.uplink.details.store.whole.path / "2-2.npz").write_bytes(b"PK damaged")
     world.run(5.0)
     world.inbox.ask([(2, 1), (2, 2), (2, 3)])
     world.run(20.0)
@@ -236,14 +236,14 @@ def test_details_that_there_are_not_are_answered_once_and_not_asked_for_again(wo
     world.run(20.0)
     assert world.inbox.wanted == set()
     assert sorted(world.detail_keys) == [0, 3]
-    assert (world.uplink.details.whole.path / "2-2.npz").read_bytes() == b"PK damaged"
+    assert (world.uplink.details.store.whole.path / "2-2.npz").read_bytes() == b"PK damaged"
 
 
 def test_an_answer_that_is_lost_is_given_again(world):
     world.run(5.0)
     world.submap(0)
     world.run(10.0)
-    world.uplink.details.whole.remove((2, 0))
+    world.uplink.details.store.whole.remove((2, 0))
     world.arrives = lambda to_post, now_s: not (to_post and now_s < 25.0)
     world.inbox.ask()
     world.run(30.0)
@@ -255,10 +255,10 @@ def test_details_are_packed_when_they_are_asked_for_and_the_whole_submap_goes(wo
     world.run(5.0)
     world.submap(0)
     world.run(10.0)
-    store = world.uplink.details
+    store = world.uplink.details.store
     assert (list(store.folder.sizes), list(store.whole.sizes)) == ([], [(2, 0)])
     world.start_agent()
-    store = world.uplink.details
+    store = world.uplink.details.store
     world.inbox.ask()
     world.run(10.0)
     assert (list(store.folder.sizes), list(store.whole.sizes)) == ([(2, 0)], [])
@@ -297,7 +297,7 @@ def test_details_whose_file_is_gone_are_left_out(world):
     for index in range(3):
         world.submap(index)
     world.run(20.0)
-    for path in world.uplink.details.whole.path.iterdir():
+    for path in world.uplink.details.store.whole.path.iterdir():
         path.unlink()
     world.inbox.ask([(2, 1)])
     world.run(20.0)
@@ -309,11 +309,11 @@ def test_packed_details_whose_file_is_gone_are_answered_too(world):
     world.run(5.0)
     world.submap(0)
     world.run(10.0)
-    store = world.uplink.details
-    store.want([(2, 0, 1)])
-    assert store.ready(world.now_s) == (2, 0)
-    (store.folder.path / "2-0.submap").unlink()
-    store.want([])
+    details = world.uplink.details
+    details.want([(2, 0, 1)])
+    assert details.ready(world.now_s) == (2, 0)
+    (details.store.folder.path / "2-0.submap").unlink()
+    details.want([])
     world.inbox.ask()
     world.run(1.0)
     assert world.told_none == [1]
@@ -328,7 +328,7 @@ def test_many_that_an_agent_lacks_do_not_keep_others_waiting(world):
         world.submap(index)
     world.run(150.0)
     for index in scattered[:-1]:
-        world.uplink.details.whole.remove((2, index))
+        world.uplink.details.store.whole.remove((2, index))
     assert world.inbox.ask([(2, index) for index in scattered]) == len(scattered)
     world.run(30.0)
     assert world.detail_keys == [scattered[-1]]

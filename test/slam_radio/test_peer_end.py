@@ -30,7 +30,7 @@ class Node:
     def listen(self, *args, **more):
         pass
 
-    listen_together = advertise = broadcast = listen
+    listen_together = advertise = broadcast = serve = listen
 
     def publish(self, topic, message):
         self.published[topic] += 1

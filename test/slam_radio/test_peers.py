@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,11 @@ from slam_bringup.processes.node_graph import NodeSpec, peer_nodes  # noqa: E402
 from slam_core.messages import SUBMAP_TOPICS, odometry_message, submap_messages  # noqa: E402
 from slam_core.ros import sensor_qos  # noqa: E402
 from slam_core.types import PoseEstimate, Submap  # noqa: E402
-from slam_radio.packing.light_submap import pack, unpack  # noqa: E402
+from slam_radio.packing.light_submap import LightConfig, pack, unpack  # noqa: E402
+from slam_radio.packing.submap_details import with_details  # noqa: E402
+from slam_radio.queues.detail_store import DetailStore  # noqa: E402
 
+LIGHT = LightConfig(landmarks=11)
 _PORTS = 5
 """Ports that are tried: one that was free may be taken a moment later."""
 
@@ -97,17 +101,21 @@ class Peers:
             for topic, message in zip(SUBMAP_TOPICS, submap_messages(types, submap), strict=True):
                 self.senders[f"/{name}/{topic}"].publish(message)
 
+    def finish_and_save(self, name: str) -> None:
+        for service in ("finish", "save_map"):
+            assert self.probe.call(f"/{name}/peers/sjsam/{service}").success
+
     def says(self, node: str) -> bool:
         """True if a node has told of itself."""
         return any(status.name == node for m in self.probe.received["/diagnostics"] for status in m.status)
 
-    def has(self, node: str, count: int) -> bool:
-        """True if the newest diagnostics of a sjsam say that it has received so many submaps."""
+    def has(self, node: str, count: int, what: str = "submaps received") -> bool:
+        """True if the newest diagnostics of a sjsam count so many submaps."""
         for message in reversed(self.probe.received["/diagnostics"]):
             for status in message.status:
                 if status.name == node:
                     values = {pair.key: pair.value for pair in status.values}
-                    return int(values.get("submaps received", 0)) == count
+                    return int(values.get(what, 0)) == count
         return False
 
 
@@ -132,6 +140,8 @@ def test_two_agents_that_meet_have_the_map_that_a_post_would_have(
             "bert": peer_nodes("bert", {"anna": address}, (), SystemConfig()),
         }
         specs["anna"][0].parameters.pop("scouting")  # nobody else's agents are to be found by a test
+        for nodes in specs.values():
+            nodes[0].parameters["light.landmarks"] = LIGHT.landmarks
         return specs
 
     specs, count = peers.start_link_at_a_free_port(specs_at), sum(map(len, own.values()))
@@ -151,19 +161,51 @@ def test_two_agents_that_meet_have_the_map_that_a_post_would_have(
 
     peers.probe.wait(pose_has_come, f"bert does not hear where anna is: {peers.log()}")
     for name in own:
-        for service in ("finish", "save_map"):
-            assert peers.probe.call(f"/{name}/peers/sjsam/{service}").success
-
-    with MapSession(SjsamNodeConfig(agents=tuple(own), map_frame="peers_map")) as post:
-        for submap in in_order([unpack(pack(s)) for submaps in own.values() for s in submaps]):
-            post.add(submap)
-        post.finish().result()
-        post.save(tmp_path / "post").result()
+        peers.finish_and_save(name)
+    maps = [peers.map_of(nodes[-1]) for nodes in specs.values()]
+    post_map(own, tmp_path / "post", light_as_sent)
     graph = storage.read(tmp_path / "post").state.graph
     ends = [(graph.records[k.first].key[0], graph.records[k.second].key[0]) for k in graph.links if k.is_closure]
     assert any(first != second for first, second in ends), "the agents have not met"
-    folders = [tmp_path / "post", *(peers.map_of(nodes[-1]) for nodes in specs.values())]
-    of_post, of_anna, of_bert = ({p.name: p.read_bytes() for p in folder.iterdir()} for folder in folders)
+    of_post, of_anna, of_bert = map(contents, (tmp_path / "post", *maps))
     assert of_anna == of_bert
     assert of_anna == of_post
+
+    for name in own:
+        assert peers.probe.call(f"/{name}/peers/radio_link/request_details").success
+    left_out = sum(len(s.landmarks) > LIGHT.landmarks for submaps in own.values() for s in submaps)
+    for name in own:
+        have = partial(peers.has, f"/{name}/peers/sjsam", left_out, "submaps refined")
+        peers.probe.wait(have, f"{name} lacks details: {peers.log()}")
+        peers.finish_and_save(name)
+    post_map(own, tmp_path / "post_with_details", partial(detailed_as_sent, tmp_path / "details"))
+    detailed, of_anna, of_bert = map(contents, (tmp_path / "post_with_details", *maps))
+    assert detailed != of_post
+    assert of_anna == of_bert
+    assert of_anna == detailed
     assert "Traceback" not in peers.log()
+
+
+def post_map(own: dict[str, list[Submap]], folder: Path, sent: Callable[[Submap], Submap]) -> None:
+    """The map that a post makes of what is sent."""
+    with MapSession(SjsamNodeConfig(agents=tuple(own), map_frame="peers_map")) as post:
+        for submap in in_order([sent(s) for submaps in own.values() for s in submaps]):
+            post.add(submap)
+        post.finish().result()
+        post.save(folder).result()
+
+
+def light_as_sent(submap: Submap) -> Submap:
+    return unpack(pack(submap, LIGHT))
+
+
+def detailed_as_sent(folder: Path, submap: Submap) -> Submap:
+    """The submap as it is when its details have come."""
+    key, store = (submap.session, submap.index), DetailStore(folder / f"{submap.agent}-{submap.index}")
+    store.keep(key, submap, pack(submap, LIGHT))
+    details = store.read(key) if store.pack(key) else None
+    return light_as_sent(submap) if details is None else with_details(pack(submap, LIGHT), details)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}

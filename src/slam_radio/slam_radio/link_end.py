@@ -10,8 +10,11 @@ from typing import Any, Protocol
 
 from slam_core.health import Health
 from slam_core.messages import MessageTypes
+from slam_core.types import Submap
 from slam_radio.link_state import LinkState
+from slam_radio.queues.detail_store import DetailStore
 from slam_radio.radio_config import RadioConfig
+from slam_radio.wire.index_ranges import Key
 from slam_radio.zenoh_link import ZenohLink
 
 
@@ -63,6 +66,14 @@ class End:
                 f"{count} files in {folder} are of another version of this program, or damaged: "
                 f"they are kept, and not {use}"
             )
+
+    def keep_details(self, store: DetailStore, key: Key, submap: Submap, message: bytes) -> None:
+        """Keep what the message of a submap leaves out; a submap goes out without that too."""
+        try:
+            store.keep(key, submap, message)
+        except OSError as error:
+            self.node.health.count("submaps whose details cannot be kept")
+            self.node.get_logger().warning(f"details of submap {key[1]} cannot be kept: {error}")
 
     def hear(self, key: str, handle: Callable[[str, bytes], None]) -> None:
         """Have messages under a key handled in the node's own thread; damaged ones are counted."""

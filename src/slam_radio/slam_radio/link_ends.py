@@ -29,6 +29,7 @@ from slam_radio.downlink import Downlink
 from slam_radio.link_end import End, LinkNode
 from slam_radio.link_state import LinkState
 from slam_radio.packing.light_submap import pack
+from slam_radio.queues.detail_sender import DetailSender
 from slam_radio.queues.detail_store import DetailStore
 from slam_radio.queues.inbox import Inbox
 from slam_radio.queues.outbox import Outbox
@@ -46,10 +47,8 @@ class AgentEnd(End):
         config = node.config
         self.name = config.agents[0]
         outbox = Outbox(node.state_folder / "outbox" / self.name)
-        self.details = DetailStore(
-            node.state_folder / "details" / self.name, config.bytes_per_second, config.resend_after_s,
-            1e6 * config.whole_megabytes,
-        )  # fmt: skip
+        self.store = DetailStore(node.state_folder / "details" / self.name, 1e6 * config.whole_megabytes)
+        self.details = DetailSender(self.store, config.bytes_per_second, config.resend_after_s)
         self.views = AgentViews(self, self.name)
         self.uplink = Uplink(
             outbox, config.bytes_per_second, config.resend_after_s, config.silent_after_s, self.details,
@@ -58,7 +57,7 @@ class AgentEnd(End):
         self._odometry: Message | None = None
         self._T_map_odom: FloatArray | None = None
         self.tell_strangers(outbox.strangers, "sent")
-        self.tell_strangers(self.details.strangers, "sent")
+        self.tell_strangers(self.store.strangers, "sent")
         if waiting := outbox.waiting:
             node.get_logger().info(f"{len(waiting)} submaps of before wait for the post")
         node.listen_together(SUBMAP_TOPICS, self.on_submap, latched=True, required=False, stamps=StampPolicy.ANY)
@@ -79,11 +78,7 @@ class AgentEnd(End):
         submap = replace(submap, agent=self.name)
         self.views.on_submap(submap)
         message = pack(submap, self.node.config.light)
-        try:
-            self.details.keep(key, submap, message)
-        except OSError as error:
-            self.node.health.count("submaps whose details cannot be kept")
-            self.node.get_logger().warning(f"details of submap {submap.index} cannot be kept: {error}")
+        self.keep_details(self.store, key, submap, message)
         try:
             self.uplink.add_submap(key, message, time.monotonic())
         except OSError as error:
@@ -132,7 +127,7 @@ class AgentEnd(End):
         """Health of the link."""
         counts = {
             "submaps waiting": len(self.uplink.outbox.waiting), "resent": self.uplink.resent,
-            "details sent": self.details.sent, "details that cannot be told": self.details.damaged,
+            "details sent": self.details.sent, "details that cannot be told": self.store.damaged,
         }  # fmt: skip
         self.node.health.take(counts)
         self.views.show()
@@ -141,7 +136,7 @@ class AgentEnd(End):
     def close(self) -> None:
         """Keep what waits for the next start."""
         self.uplink.outbox.close()
-        self.details.folder.close()
+        self.store.close()
         self.views.close()
 
 
@@ -163,9 +158,7 @@ class PostEnd(End):
                 f"{agent}/map_to_odom", "TransformStamped", correction,
                 latched=True, required=False, stamps=StampPolicy.ANY,
             )  # fmt: skip
-        node.listen("map/undecided", "DiagnosticArray", self.on_undecided, latched=True, required=False,
-                    stamps=StampPolicy.ANY)  # fmt: skip
-        node.serve("~/request_details", self.request_details)
+        DetailRequests(node, inboxes)
         for agent in config.agents:
             self.hear(f"slam/{agent}/pose", partial(self.on_pose, agent))
             self.hear(f"slam/{agent}/submap/*/*", partial(self.on_submap, agent))
@@ -196,16 +189,6 @@ class PostEnd(End):
     def on_piece(self, agent: str, _: str, data: bytes) -> None:
         """Keep a piece of a view, and publish the view if that is whole."""
         self.views.on_piece(agent, self.downlink.on_piece(agent, data, time.monotonic()))
-
-    def on_undecided(self, message: Message) -> None:
-        """The map cannot tell if some submaps are of one place: ask for all that their agents know of them."""
-        keys = submap_keys_from_message(message)
-        for inbox in self.downlink.inboxes:
-            inbox.ask((session, index) for agent, session, index in keys if agent == inbox.agent)
-
-    def request_details(self) -> str:
-        """Ask for the details of all submaps that have come."""
-        return f"details of {sum(inbox.ask() for inbox in self.downlink.inboxes)} submaps asked for"
 
     def on_backlog(self, agent: str, _: str, data: bytes) -> None:
         """Keep what waits at an agent."""
@@ -239,6 +222,26 @@ class PostEnd(End):
         for inbox in self.downlink.inboxes:
             inbox.close()
         self.views.close()
+
+
+class DetailRequests:
+    """Requests for details of submaps that have come: of those that the map is undecided about, or of all."""
+
+    def __init__(self, node: LinkNode, inboxes: Iterable[Inbox]) -> None:
+        self._inboxes = tuple(inboxes)
+        node.listen("map/undecided", "DiagnosticArray", self.on_undecided, latched=True, required=False,
+                    stamps=StampPolicy.ANY)  # fmt: skip
+        node.serve("~/request_details", self.request_all)
+
+    def on_undecided(self, message: Message) -> None:
+        """The map cannot tell if some submaps are of one place: ask for all that their agents know of them."""
+        keys = submap_keys_from_message(message)
+        for inbox in self._inboxes:
+            inbox.ask((session, index) for agent, session, index in keys if agent == inbox.agent)
+
+    def request_all(self) -> str:
+        """Ask for the details of all submaps that have come."""
+        return f"details of {sum(inbox.ask() for inbox in self._inboxes)} submaps asked for"
 
 
 class SubmapPublisher:

@@ -33,8 +33,8 @@ class RadioConfig(Config):
     )  # fmt: skip
     silent_after_s: float = parameter(10.0, "the other end counts as silent after this time", unit="s", minimum=3.0)
     whole_megabytes: float = parameter(
-        500.0, "whole submaps that an agent keeps on disk for a post that asks for details; of older ones it keeps the "
-        "details packed, a thousandth of that", unit="MB", minimum=0.0,
+        500.0, "whole submaps that an agent keeps on disk for who asks for details, a post or a peer; of older ones it "
+        "keeps the details packed, a thousandth of that", unit="MB", minimum=0.0,
     )  # fmt: skip
     views: ViewConfig = group(ViewConfig)
     state_path: str = parameter(

@@ -10,13 +10,13 @@ submap waits, and pictures and dense key frames when no details go out either.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from slam_core.health import State
 from slam_radio.link_state import Carriage, Hearing, LinkState
 from slam_radio.queues.byte_budget import OVERHEAD, ByteBudget
-from slam_radio.queues.detail_store import DetailStore
+from slam_radio.queues.detail_sender import DetailSender
 from slam_radio.queues.in_flight import InFlight
 from slam_radio.queues.outbox import Outbox
 from slam_radio.views.view_sender import ViewSender
@@ -64,7 +64,7 @@ class Uplink:
 
     def __init__(
         self, outbox: Outbox, budget: float | ByteBudget, resend_after_s: float = 5.0, silent_after_s: float = 10.0,
-        details: DetailStore | None = None, views: ViewSender | None = None,
+        details: DetailSender | None = None, views: ViewSender | None = None,
     ) -> None:  # fmt: skip
         self.outbox, self.details, self.views = outbox, details, views
         self._budget = budget if isinstance(budget, ByteBudget) else ByteBudget(budget)
@@ -126,21 +126,40 @@ class Uplink:
 
     def due_details(self, now_s: float) -> list[Outgoing]:
         """Details that the post wants, and which there are not, while no submap waits."""
-        out: list[Outgoing] = []
-        if self.details is None or self.outbox.waiting or not self._hearing.is_up(now_s):
-            return out
-        if (none := self.details.none()) is not None and self._budget.allows(len(none) + OVERHEAD, now_s):
-            self._budget.spend(len(none) + OVERHEAD)
-            self.details.none_is_sent()
-            out.append(Outgoing("none", none))
-        while (key := self.details.ready(now_s)) is not None:
-            size = self.details.size(key)
-            if not self._budget.allows(size, now_s):
-                break
-            if (data := self.details.take(key, now_s)) is not None:
-                self._budget.spend(size)
-                out.append(Outgoing("details", data, key))
+        out = self.due_none(now_s)
+        while (key := self.ready_details(now_s)) is not None and self.affords_details(key, now_s):
+            out += self.take_details(key, now_s)
         return out
+
+    def due_none(self, now_s: float) -> list[Outgoing]:
+        """The details that the post wants and there are not, while no submap waits."""
+        if self.details is None or self.outbox.waiting or not self._hearing.is_up(now_s):
+            return []
+        none = self.details.none()
+        if none is None or not self._budget.allows(len(none) + OVERHEAD, now_s):
+            return []
+        self._budget.spend(len(none) + OVERHEAD)
+        self.details.none_is_sent()
+        return [Outgoing("none", none)]
+
+    def ready_details(self, now_s: float) -> Key | None:
+        """Key of the details that go out next, as soon as the budget allows; None while a submap waits."""
+        if self.details is None or self.outbox.waiting or not self._hearing.is_up(now_s):
+            return None
+        return self.details.ready(now_s)
+
+    def affords_details(self, key: Key, now_s: float) -> bool:
+        """True if the budget allows details that are ready."""
+        return self.details is not None and self._budget.allows(self.details.size(key), now_s)
+
+    def take_details(self, key: Key, now_s: float) -> list[Outgoing]:
+        """The message of details, which goes out now; none if their file is gone."""
+        assert self.details is not None
+        size = self.details.size(key)
+        if (data := self.details.take(key, now_s)) is None:
+            return []
+        self._budget.spend(size)
+        return [Outgoing("details", data, key)]
 
     def due_views(self, now_s: float) -> list[Outgoing]:
         """Pieces of views that the post lacks, and names of those which there are not, while nothing else waits."""
@@ -232,7 +251,7 @@ class Uplink:
 
 
 class UplinkTurns:
-    """Uplinks that share a budget: a submap of one, then it is the others' turn."""
+    """Uplinks that share a budget: a submap of one, then it is the others' turn; details so when no submap is due."""
 
     def __init__(self, uplinks: dict[str, Uplink]) -> None:
         self._uplinks = uplinks
@@ -241,15 +260,30 @@ class UplinkTurns:
     def due(self, now_s: float) -> list[tuple[str, Outgoing]]:
         """Messages to send now, each with the name of its link."""
         out = [(name, pose) for name in self._order for pose in self._uplinks[name].due_pose(now_s)]
-        while (turn := self._turn(now_s)) is not None:
+        while (turn := self._first(Uplink.ready, now_s)) is not None:
             name, key = turn
             if not self._uplinks[name].affords(key, now_s):
                 break  # nor may another one: a link of smaller submaps would always be sooner
             out.append((name, self._uplinks[name].take(key, now_s)))
-            self._order.remove(name)
-            self._order.append(name)
-        return out + [(name, told) for name in self._order for told in self._uplinks[name].due_backlog(now_s)]
+            self._is_served(name)
+        out += [(name, told) for name in self._order for told in self._uplinks[name].due_backlog(now_s)]
+        return out if turn is not None else out + self._due_details(now_s)
 
-    def _turn(self, now_s: float) -> tuple[str, Key] | None:
-        ready = ((name, self._uplinks[name].ready(now_s)) for name in self._order)
-        return next(((name, key) for name, key in ready if key is not None), None)
+    def _due_details(self, now_s: float) -> list[tuple[str, Outgoing]]:
+        out = [(name, none) for name in self._order for none in self._uplinks[name].due_none(now_s)]
+        while (turn := self._first(Uplink.ready_details, now_s)) is not None:
+            name, key = turn
+            if not self._uplinks[name].affords_details(key, now_s):
+                break
+            out += [(name, details) for details in self._uplinks[name].take_details(key, now_s)]
+            self._is_served(name)
+        return out
+
+    def _first(self, ready: Callable[[Uplink, float], Key | None], now_s: float) -> tuple[str, Key] | None:
+        """The first link in turn that has something ready, and the key of that."""
+        found = ((name, ready(self._uplinks[name], now_s)) for name in self._order)
+        return next(((name, key) for name, key in found if key is not None), None)
+
+    def _is_served(self, name: str) -> None:
+        self._order.remove(name)
+        self._order.append(name)

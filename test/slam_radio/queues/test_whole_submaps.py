@@ -56,8 +56,7 @@ def test_a_file_that_turns_out_damaged_takes_its_share_of_the_disk_too(tmp_path,
     store = DetailStore(tmp_path)
     store.keep((2, 0), submap, pack(submap, SIZE))
     (store.whole.path / "2-0.npz").write_bytes(b"PK damaged")
-    store.want([(2, 0, 1)])
-    assert store.ready(0.0) is None
+    assert not store.pack((2, 0))
     assert (store.damaged, store.whole.sizes, store.whole.total) == (1, {}, 10)
 
 
