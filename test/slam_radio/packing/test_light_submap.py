@@ -199,6 +199,6 @@ def test_a_message_of_more_landmarks_than_can_be_is_refused(make_submap):
 
 def test_an_older_version_is_refused_by_name(make_submap):
     data = bytearray(pack(make_submap(12)))
-    data[2] = 3
+    data[2] = 2
     with pytest.raises(ValueError, match="not a submap for the air of version 4"):
         unpack(bytes(data))

@@ -16,7 +16,7 @@ from slam_radio.packing.byte_reader import ByteReader
 Sigmas = npt.NDArray[np.float16]
 _UNIT = 1e-3
 """Standard deviations are sent in mm and mrad."""
-_AT_START = 1e-6
+AT_START = 1e-6
 """Covariance of the start, which is exact, over that of the end: keeps it positive definite."""
 _LEAST_SIGMA = 1e-8
 
@@ -49,12 +49,12 @@ class KeyPoses:
         path = submap.path
         if len(path) > most:
             path = tuple(path[i] for i in np.unique(np.linspace(0, len(path) - 1, most).round().astype(np.int64)))
-        start = PoseEstimate(submap.start_stamp_ns, np.eye(4), _AT_START * end_covariance)
+        start = PoseEstimate(submap.start_stamp_ns, np.eye(4), AT_START * end_covariance)
         end = PoseEstimate(submap.end_stamp_ns, end_pose, end_covariance)
         begins = bool(path) and _says(start, path[0])
         ends = len(path) > begins and _says(end, path[-1])
         inner = path[int(begins) : len(path) - int(ends)]
-        return cls(begins, ends, [(p.stamp_ns, p.T, _covering(p.covariance)) for p in inner])
+        return cls(begins, ends, [(p.stamp_ns, p.T, covering(p.covariance)) for p in inner])
 
     @classmethod
     def read(cls, reader: ByteReader, count: int, *, begins: bool, ends: bool) -> KeyPoses:
@@ -79,7 +79,7 @@ class KeyPoses:
         self, start_ns: int, end_ns: int, end: FloatArray, covariance: FloatArray
     ) -> tuple[PoseEstimate, ...]:
         """The poses with covariances, of a submap with these stamps, end pose and covariance of the end pose."""
-        first = [PoseEstimate(start_ns, np.eye(4), _AT_START * covariance)] if self.begins else []
+        first = [PoseEstimate(start_ns, np.eye(4), AT_START * covariance)] if self.begins else []
         last = [PoseEstimate(end_ns, end, covariance)] if self.ends else []
         inner = [
             PoseEstimate(stamp, T, np.diag((_UNIT * sigmas.astype(np.float64)) ** 2)) for stamp, T, sigmas in self.inner
@@ -108,7 +108,7 @@ def _says(known: PoseEstimate, pose: PoseEstimate) -> bool:
     return bool(np.linalg.eigvalsh(L @ pose.covariance @ L.T)[-1] <= 1.0 + 1e-6)
 
 
-def _covering(covariance: FloatArray) -> Sigmas:
+def covering(covariance: FloatArray) -> Sigmas:
     """Standard deviations whose diagonal covariance less another one is positive semidefinite, rounded up."""
     scale = np.sqrt(np.maximum(np.diag(covariance), _LEAST_SIGMA**2))
     share = max(1.0, float(np.linalg.eigvalsh(covariance / np.outer(scale, scale))[-1]))

@@ -64,8 +64,12 @@ class LandmarkBlock:
         writer.columns(self.codes)
 
     @classmethod
-    def read(cls, reader: SymbolReader, exponent: int, n: int, rank: int, width: int) -> LandmarkBlock:
+    def read(
+        cls, reader: SymbolReader, exponent: int, n: int, rank: int, width: int, *, has_ids_together: bool = False
+    ) -> LandmarkBlock:
         """The landmarks of a message.
+
+        ``has_ids_together``: the first id stands in one column with the others, as in messages of an earlier version.
 
         Raises
         ------
@@ -76,7 +80,9 @@ class LandmarkBlock:
             raise ValueError(f"a submap for the air cannot have {n} landmarks, {rank} directions, {width} numbers")
         columns = [reader.column(n) for _ in range(9)]
         cells, factors = np.stack(columns[:3], axis=1), np.stack(columns[3:], axis=1)
-        first, steps, sightings = (reader.column(count) for count in (min(n, 1), max(n - 1, 0), n))
+        counts = (n,) if has_ids_together else (min(n, 1), max(n - 1, 0))
+        first, steps = np.split(np.concatenate([reader.column(count) for count in counts]), [1])
+        sightings = reader.column(n)
         common, codes = reader.columns(3 * n, rank), reader.columns(n, width)
         if (
             np.abs(cells).max(initial=0) >= _MOST_CELLS

@@ -32,13 +32,17 @@ to the end          columns of numbers, range coded (:mod:`slam_radio.packing.sy
                     6 of factors, the first id, the others less those before, sightings, at most 255,
                     (3n, r) of U, (n, c) of descriptors (:mod:`slam_radio.packing.descriptor_code`)
 ==================  ===================================================================================
+
+Version 3 is read too: files of before lie on disks. Its poses of the path have no standard deviations; behind them
+stands an f16 for each, for those that are left out too: the factor by which the end pose's covariance covers its own.
+All ids are one column, the first one too.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -49,12 +53,13 @@ from slam_core.types import Submap
 from slam_radio.packing.byte_reader import ByteReader
 from slam_radio.packing.compact_gaussian import MOST_INFLATION, CompactGaussian, compact_gaussian
 from slam_radio.packing.descriptor_code import decode, encode, is_of_basis
+from slam_radio.packing.earlier_poses import EarlierPoses
 from slam_radio.packing.key_poses import KeyPoses, pose_of, tangent_of
 from slam_radio.packing.landmark_block import LandmarkBlock, grid_exponent, half_step, on_grid, shown_sightings
 from slam_radio.packing.landmark_choice import choose_landmarks
 from slam_radio.packing.symbol_code import IntArray, SymbolReader, SymbolWriter
 
-MAGIC, VERSION = b"SL", 4
+MAGIC, VERSION, _EARLIER = b"SL", 4, 3
 MOST_BYTES = 2**16
 ENVELOPE = struct.Struct("<2sBI")
 _HEADER, _STAMPS, _COUNTS = struct.Struct("<IIB"), struct.Struct("<qq"), struct.Struct("<HBbHHB")
@@ -210,7 +215,8 @@ def write(light: LightSubmap) -> bytes:
 
 def read(data: bytes) -> LightSubmap:
     """The content of a message; ``ValueError`` as :func:`unpack`."""
-    reader = ByteReader(opened(data, MAGIC, VERSION, "submap for the air"))
+    version = said_version(data, VERSION, _EARLIER)
+    reader = ByteReader(opened(data, MAGIC, version, "submap for the air"))
     agent = reader.text(reader.number("<B"))
     session, index, flags = reader.numbers(_HEADER.format)
     start, end = reader.numbers(_STAMPS.format)
@@ -218,25 +224,37 @@ def read(data: bytes) -> LightSubmap:
     end_pose = pose_of(reader.floats("<f4", (6,)))
     pose = reader.array("<f2", (21,)).astype(np.float16)
     (inflation,) = reader.numbers("<f")
-    path = KeyPoses.read(reader, k, begins=bool(flags & _BEGINS), ends=bool(flags & _ENDS))
+    begins, ends = bool(flags & _BEGINS), bool(flags & _ENDS)
+    poses: type[KeyPoses | EarlierPoses] = EarlierPoses if version == _EARLIER else KeyPoses
+    path = poses.read(reader, k, begins=begins, ends=ends)
     if not 1.0 <= inflation < MOST_INFLATION or flags > 7 or end < start:
         raise ValueError("a submap for the air holds numbers that cannot be")
     if width != dimension and not is_of_basis(width, dimension):
         raise ValueError(f"a submap for the air has descriptors of {dimension} numbers, of which it sends {width}")
     symbols = SymbolReader(reader.bytes())
     pose_common = symbols.columns(6, min(rank, 65))
-    landmarks = LandmarkBlock.read(symbols, exponent, n, rank, width)
+    landmarks = LandmarkBlock.read(symbols, exponent, n, rank, width, has_ids_together=version == _EARLIER)
     symbols.require_end()
-    return LightSubmap(
+    light = LightSubmap(
         agent=agent, session=session, index=index, follows_previous=bool(flags & _FOLLOWS), start_stamp_ns=start,
         end_stamp_ns=end, end_pose=end_pose, dimension=dimension, pose=pose, pose_common=pose_common,
-        path=path, inflation=inflation, landmarks=landmarks,
+        path=KeyPoses(begins, ends, []) if isinstance(path, EarlierPoses) else path, inflation=inflation,
+        landmarks=landmarks,
     )  # fmt: skip
+    if not isinstance(path, EarlierPoses):
+        return light
+    light.gaussian.require_positive()
+    return replace(light, path=path.key_poses(start, end, end_pose, light.gaussian.end_covariance()))
 
 
 def sealed(magic: bytes, version: int, rest: bytes) -> bytes:
     """A message with its envelope."""
     return ENVELOPE.pack(magic, version, zlib.crc32(rest)) + rest
+
+
+def said_version(data: bytes, *known: int) -> int:
+    """The version of a message, the first known one if it is none of those."""
+    return data[2] if len(data) > 2 and data[2] in known else known[0]
 
 
 def opened(data: bytes, magic: bytes, version: int, name: str, most_bytes: int = MOST_BYTES) -> bytes:

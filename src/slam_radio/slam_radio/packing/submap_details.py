@@ -10,6 +10,8 @@ u16, i8, f32        number of landmarks, power of two m of their grid, inflation
 to the end          the landmarks' columns as in :mod:`slam_radio.packing.light_submap`, with its r and c
 ==================  ===================================================================================
 
+Version 1 is read too: all ids are one column, the first one too.
+
 Nothing of the submap's message is said again: its Gaussian goes on (``extended`` of
 :mod:`slam_radio.packing.compact_gaussian`), by the same common directions.
 """
@@ -33,10 +35,10 @@ from slam_radio.packing.landmark_block import (
     shown_sightings,
 )
 from slam_radio.packing.landmark_choice import choose_landmarks
-from slam_radio.packing.light_submap import ENVELOPE, LightSubmap, opened, read, sealed, unknowns_of
+from slam_radio.packing.light_submap import ENVELOPE, LightSubmap, opened, read, said_version, sealed, unknowns_of
 from slam_radio.packing.symbol_code import SymbolReader, SymbolWriter
 
-MAGIC, VERSION = b"SD", 2
+MAGIC, VERSION, _EARLIER = b"SD", 2, 1
 _NAME = "details of a submap"
 _NUMBERS, _COUNTS = struct.Struct("<III"), struct.Struct("<Hbf")
 
@@ -84,7 +86,7 @@ def pack_details(submap: Submap, light: LightSubmap, message: bytes) -> bytes | 
 
 def key_of_details(data: bytes) -> tuple[int, int]:
     """Session and index of the submap that details are of; ``ValueError`` for damaged ones."""
-    reader = ByteReader(opened(data, MAGIC, VERSION, _NAME))
+    reader = ByteReader(_opened(data))
     reader.text(reader.number("<B"))
     session, index, _ = reader.numbers(_NUMBERS.format)
     return session, index
@@ -98,7 +100,7 @@ def with_details(message: bytes, data: bytes) -> Submap:
     ValueError
         If either is damaged or says what cannot be, or the details are of another message.
     """
-    light, reader = read(message), ByteReader(opened(data, MAGIC, VERSION, _NAME))
+    light, reader = read(message), ByteReader(_opened(data))
     of = (reader.text(reader.number("<B")), *reader.numbers(_NUMBERS.format))
     if of != (light.agent, light.session, light.index, ENVELOPE.unpack_from(message)[2]):
         raise ValueError(f"details of {of[0]} {of[1]}/{of[2]} are not of this submap's message")
@@ -108,9 +110,14 @@ def with_details(message: bytes, data: bytes) -> Submap:
         raise ValueError(f"details of a submap cannot have {n} landmarks and a factor of {inflation}")
     symbols = SymbolReader(reader.bytes())
     rank, width = light.pose_common.shape[1], block.codes.shape[1]
-    further = LandmarkBlock.read(symbols, exponent, n, rank, width)
+    is_earlier = said_version(data, VERSION, _EARLIER) == _EARLIER
+    further = LandmarkBlock.read(symbols, exponent, n, rank, width, has_ids_together=is_earlier)
     symbols.require_end()
     if np.isin(further.ids, block.ids).any():
         raise ValueError("details of a submap have a landmark that its message had")
     rays = further.points - light.middle
     return light.submap(light.gaussian.followed_by(further.factors, rays, further.common, inflation), further)
+
+
+def _opened(data: bytes) -> bytes:
+    return opened(data, MAGIC, said_version(data, VERSION, _EARLIER), _NAME)
