@@ -68,6 +68,23 @@ def test_blocks_that_are_nearly_singular_or_cannot_be_are_refused(make_submap, c
         replace(found, **changed).require_positive()
 
 
+@pytest.mark.parametrize("m", [3, 6])
+def test_singular_values_are_left_out_only_where_the_determinant_tells(rng, m, monkeypatch):
+    decomposed = []
+    svd = np.linalg.svd
+    monkeypatch.setattr(np.linalg, "svd", lambda L, **options: decomposed.append(len(L)) or svd(L, **options))
+    count = {True: 0, False: 0}
+    for exponent in rng.uniform(-6.0, 2.0, 600):
+        L = np.tril(rng.normal(size=(1, m, m)), -1) + 10.0**exponent * np.eye(m)
+        L /= np.linalg.norm(L, axis=-1, keepdims=True)
+        nearly = module._is_nearly_singular(L)
+        assert nearly == (svd(L, compute_uv=False).min() < module._LEAST_SHARE)
+        count[nearly] += 1
+    assert min(count.values()) > 100
+    assert len(decomposed) < 600
+    assert not module._is_nearly_singular(np.empty((0, m, m)))
+
+
 @pytest.mark.parametrize("rank", [1, 8])
 def test_with_more_landmarks_it_is_not_surer_either(make_submap, rank):
     submap = make_submap(40, common=5)

@@ -114,7 +114,7 @@ class CompactGaussian:
             raise ValueError("a submap for the air has a covariance that cannot be")
         for L in (_pose_factor(self.pose), _factors(self.factors)):
             length = np.linalg.norm(L, axis=-1, keepdims=True)
-            if not (length > 0.0).all() or np.linalg.svd(L / length, compute_uv=False).min(initial=1.0) < _LEAST_SHARE:
+            if not (length > 0.0).all() or _is_nearly_singular(L / length):
                 raise ValueError("a submap for the air has a covariance that is not positive definite")
 
     def end_covariance(self) -> FloatArray:
@@ -193,6 +193,18 @@ def extended(
     return _with_least_factor(
         S, replace(rounded, common=np.concatenate([gaussian.common, _rounded(more)])), B, whitened
     )
+
+
+def _is_nearly_singular(triangles: FloatArray) -> bool:
+    """True if one of some triangular matrices (..., m, m) with rows of length 1 has too small a singular value.
+
+    That is at least the determinant over m^((m - 1) / 2), since none is larger than m^0.5: mostly enough to know.
+    """
+    m = triangles.shape[-1]
+    determinants = np.abs(np.prod(np.diagonal(triangles, axis1=-2, axis2=-1), axis=-1))
+    if determinants.min(initial=1.0) > 2.0 * _LEAST_SHARE * m ** (0.5 * (m - 1)):
+        return False
+    return bool(np.linalg.svd(triangles, compute_uv=False).min(initial=1.0) < _LEAST_SHARE)
 
 
 def _sum(S: FloatArray, blocks: BlockDiagonal) -> FloatArray:
