@@ -11,7 +11,7 @@ that are sent, and the claimed sigma of the submaps' ends over that of whole sub
 
 ``--only``: what is done to submaps, to find what a loss is due to: ``landmarks`` are chosen, ``descriptors`` coded,
 the ``gaussian`` compacted, the ``path`` thinned, and nothing else. ``--details``: with the details of all submaps,
-which count too.
+which count too; ``--asked``: with those of the submaps that the map is undecided about, as a post asks for them.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from rich.table import Table
 
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.map_file import storage
+from sjsam_node.map_file.refining import undecided
 from slam_core.evaluation import align, associate, evaluate
 from slam_core.geometry import FloatArray
 from slam_core.runtime.memory import share_one_heap
@@ -45,6 +46,7 @@ _COLUMNS = ("run", "landmarks", "kB", "kB/m", "pack", "unpack", "closures", "of 
             "sigma", "least")  # fmt: skip
 _TRUTH_GAP_S = 0.1
 T = TypeVar("T")
+Key = tuple[str, int, int]
 Ends = tuple[tuple[str, int, int], tuple[str, int, int]]
 
 
@@ -64,7 +66,9 @@ def main() -> None:
     parser.add_argument("--landmarks", type=int, nargs="+", default=(64, 96, 128, 160))
     parser.add_argument("--rank", type=int, default=LightConfig().rank)
     parser.add_argument("--only", choices=("landmarks", "descriptors", "gaussian", "path"))
-    parser.add_argument("--details", action="store_true")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--details", action="store_true")
+    which.add_argument("--asked", action="store_true")
     arguments = parser.parse_args()
     share_one_heap()  # as nodes do
     table = Table(*_COLUMNS)
@@ -80,19 +84,21 @@ def main() -> None:
             if arguments.only:
                 light, figures = [partly(s, arguments.only, config) for s in submaps], [""] * 4
             else:
-                light, figures = packed(submaps, config, with_details=arguments.details)
+                asked = {key_of(s) for s in submaps} if arguments.details else set()
+                light, figures = packed(submaps, config, asked)
+                while arguments.asked and (new := undecided_in(light) - asked):
+                    asked |= new
+                    light, figures = packed(submaps, config, asked)
             found = joined(light)
             cells = (*figures, *compared(found, whole, accuracy(found, truth, stamps)))
             table.add_row(run.name, str(landmarks), *cells)
     Console(width=140).print(table)
 
 
-def packed(
-    submaps: Sequence[Submap], config: LightConfig, *, with_details: bool = False
-) -> tuple[list[Submap], list[str]]:
-    """Submaps as they arrive, and kB, kB a metre, and ms of packing and of unpacking."""
+def packed(submaps: Sequence[Submap], config: LightConfig, asked: set[Key]) -> tuple[list[Submap], list[str]]:
+    """Submaps as they arrive, some with details; kB, kB a metre, and ms of packing and of unpacking."""
     spent: tuple[list[float], list[float]] = ([], [])
-    data = [timed(lambda s=s: messages(s, config, with_details), spent[0]) for s in submaps]  # type: ignore[misc]
+    data = [timed(lambda s=s: messages(s, config, key_of(s) in asked), spent[0]) for s in submaps]  # type: ignore[misc]
     light = [timed(lambda d=d: unpacked(*d), spent[1]) for d in data]  # type: ignore[misc]
     way = sum(float(np.linalg.norm(s.end_pose[:3, 3])) for s in submaps)
     size = sum(len(message) for both in data for message in both if message)
@@ -101,6 +107,20 @@ def packed(
         f"{size / way / 1e3:.2f}",
         *(f"{np.median(s):.1f}" for s in spent),
     ]
+
+
+def key_of(submap: Submap) -> Key:
+    """Agent, session and index."""
+    return submap.agent, submap.session, submap.index
+
+
+def undecided_in(submaps: Sequence[Submap]) -> set[Key]:
+    """Submaps that their map is undecided about at some time, as they come."""
+    joined_map, found = GlobalMap(), set[Key]()
+    for submap in submaps:
+        joined_map.add(submap)
+        found |= undecided(joined_map.estimate.graph, joined_map.detector.pending)
+    return found
 
 
 def messages(submap: Submap, config: LightConfig, with_details: bool) -> tuple[bytes, bytes | None]:
