@@ -176,6 +176,8 @@ class Downlink:
                 data = pack_look(lacks)
                 if self._take_budget(data, now_s):
                     agent.looked_at_s, agent.looks = now_s, lacks
+                    if lacks and agent.views is not None:
+                        agent.views.told()
                     out.append(Message(name, "look", data))
             if agent.correction_is_due(now_s) and agent.hearing.is_up(now_s):
                 data = pack_correction(*agent.correction)  # type: ignore[misc]

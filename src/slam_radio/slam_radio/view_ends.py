@@ -135,7 +135,7 @@ class PostViews:
 
     def __init__(self, end: End, agents: Iterable[str]) -> None:
         self.end, self.node = end, end.node
-        config, folder = self.node.config, self.node.state_folder / "views"
+        config, folder = self.node.config, self.node.state_folder / "asked_views"  # an agent of this state has "views"
         self.inboxes = {a: ViewInbox(a, folder / a, 1e6 * config.views.megabytes) for a in agents}
         self._paths: dict[str, Trajectory] = {}
         self._submaps: dict[str, dict[tuple[int, int], tuple[int, int]]] = {a: {} for a in self.inboxes}
@@ -217,10 +217,15 @@ class PostViews:
             self.node.publish(f"{agent}/{topic}", message)
 
     def show(self) -> None:
-        """Counts in the diagnostics."""
+        """Counts in the diagnostics, and views that the start has found whole: all nodes of this process listen now."""
+        for agent, inbox in self.inboxes.items():
+            for view in inbox.finished:
+                self.publish(agent, view)
+            inbox.finished = []
         inboxes = self.inboxes.values()
         self.node.health.take({
             "views wanted": sum(len(i.wanted) for i in inboxes), "pieces repeated": sum(i.repeated for i in inboxes),
+            "views given up": sum(i.given_up for i in inboxes),
         })  # fmt: skip
 
     def reset(self) -> None:

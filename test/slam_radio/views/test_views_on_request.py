@@ -215,6 +215,91 @@ def test_a_look_tells_the_pieces_that_have_come():
     assert [n for n in range(8) if lack.has(n)] == [0, 1, 3, 6]
 
 
+def a_whole_one(world: World) -> None:
+    """A picture is asked for and all its pieces come, but the disk is full as they are put together."""
+    key = ViewKey(PICTURE, SESSION, 10**9)
+    pieces = pieces_of(key, 10**9, pack_view(picture(10**9)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(world.views.files, "add", full_disk)
+        for piece in pieces[:-1]:
+            world.views.take(pack_piece(piece))
+        with pytest.raises(OSError, match="no space"):
+            world.views.take(pack_piece(pieces[-1]))
+
+
+def full_disk(*_):
+    raise OSError("no space left on device")
+
+
+def test_a_view_that_could_not_be_written_is_kept_with_the_next_piece(world):
+    keep(world, 10**9)
+    world.run(5.0)
+    ask(world, 10**9)
+    a_whole_one(world)
+    world.run(10.0)
+    assert world.seen == [10**9]
+    assert world.views.wanted == []
+    assert len(world.pieces) == 1
+
+
+def test_a_view_that_was_whole_when_the_post_ended_is_there_after_a_restart(world):
+    ask(world, 10**9)
+    ask(world, 3 * 10**9)
+    a_whole_one(world)
+    world.start_post()
+    assert [view.stamp_ns for view in world.views.finished] == [10**9]
+    assert world.views.wanted == [ViewKey(PICTURE, SESSION, 3 * 10**9)]
+    assert ask(world, 10**9).stamp_ns == 10**9
+    world.start_post()
+    assert world.views.finished == []
+
+
+def test_a_view_in_whose_place_a_strange_file_is_is_wanted_no_more(world):
+    keep(world, 10**9)
+    world.run(5.0)
+    ask(world, 10**9)
+    (world.folder / "views" / f"{PICTURE}-{SESSION}-{10**9}.view").write_bytes(b"another")
+    pieces = pieces_of(ViewKey(PICTURE, SESSION, 10**9), 10**9, pack_view(picture(10**9)))
+    for piece in pieces[:-1]:
+        world.views.take(pack_piece(piece))
+    with pytest.raises(ValueError, match="move it away"):
+        world.views.take(pack_piece(pieces[-1]))
+    assert world.views.wanted == []
+    assert not list((world.folder / "views" / "pieces").iterdir())
+
+
+def test_old_requests_that_nobody_answers_do_not_keep_a_new_one_waiting(world):
+    for k in range(90):
+        ask(world, k * 10**11)
+    keep(world, 10**9)
+    ask(world, 10**9)
+    assert len(world.views.wanted) == 64
+    assert world.views.given_up == 27
+    world.uplink.views.unseen = lambda: None  # an agent that does not answer what it lacks
+    world.run(30.0)
+    assert world.seen == [10**9]
+    assert len(world.views.wanted) == 63
+
+
+def test_what_an_agent_does_not_answer_for_half_an_hour_is_given_up(world):
+    ask(world, 10**9)
+    world.arrives = lambda to_post, now_s: not to_post
+    world.run(60.0)
+    assert world.looks == 0  # it is not heard: that does not count
+    for _ in range(599):
+        world.views.told()
+    world.views.give_up([])  # an answer
+    for _ in range(599):
+        world.views.told()
+    assert len(world.views.wanted) == 1
+    world.arrives = lambda to_post, now_s: True
+    world.uplink.views.unseen = lambda: None
+    world.run(10.0)
+    assert world.looks > 0
+    assert world.views.wanted == []
+    assert world.views.given_up == 1
+
+
 def test_pieces_of_before_that_are_damaged_or_not_wanted_are_dropped_at_the_start(world):
     ask(world, 10**9)
     key = ViewKey(PICTURE, SESSION, 10**9)

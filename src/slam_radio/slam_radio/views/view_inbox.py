@@ -7,6 +7,7 @@ import json
 import re
 import zlib
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from slam_core.storage.files import atomic_path, atomic_text, read_bytes, read_json
@@ -16,17 +17,25 @@ from slam_radio.wire.view_messages import MOST_VIEWS, PIECE_BYTES, Lack, Piece, 
 
 _SAME_NS = 100_000_000
 """An image that is there is shown instead of asking for one of so nearly the same moment, ns."""
+_MOST_WANTED = 64
+"""Requests; of more the oldest is given up."""
+_MOST_LOOKS = 600
+"""Looks in a row that an agent may leave without an answer: half an hour of a link that is up."""
 _NAME = re.compile(r"([12])-(\d{1,10})-(\d{1,19})-(\d{1,5})\.piece")
 _MOST_PIECE_FILE = PIECE_BYTES + 100
 
 
 class ViewInbox:
-    """The views of one agent at the post; a restart finds what was asked for and every piece that has come."""
+    """The views of one agent at the post; a restart finds what was asked for and every piece that has come.
+
+    ``finished``: views that the start has found whole. ``given_up``: how many requests are wanted no more
+    because nobody answered, or newer ones are too many.
+    """
 
     def __init__(self, agent: str, path: Path, most_bytes: float) -> None:
         self.agent = agent
         self.files = ViewFiles(path, most_bytes)
-        self.repeated = self.damaged = 0
+        self.repeated = self.damaged = self.given_up = self._unanswered = 0
         self._wanted_file, self._folder = path / "wanted.json", path / "pieces"
         self.wanted: list[ViewKey] = _read_keys(self._wanted_file)
         self._pieces: dict[ViewKey, dict[int, Piece]] = {key: {} for key in self.wanted}
@@ -34,6 +43,7 @@ class ViewInbox:
         for file in sorted(self._folder.iterdir()):
             if _NAME.fullmatch(file.name):
                 self._find(file)
+        self.finished = self._finish()
 
     def _find(self, file: Path) -> None:
         """Take a piece of before; one that is damaged, or of a view that is not wanted any more, is removed."""
@@ -42,10 +52,21 @@ class ViewInbox:
         except ValueError:
             piece = None
         others = self._pieces.get(piece.key) if piece is not None else None
-        if piece is None or others is None or any(p.checksum != piece.checksum for p in others.values()):
+        if piece is None or others is None or any(_differs(piece, other) for other in others.values()):
             file.unlink(missing_ok=True)
         else:
             others[piece.number] = piece
+
+    def _finish(self) -> list[View]:
+        """Keep views of which the last piece came just before the end of the last run."""
+        views = []
+        for pieces in list(self._pieces.values()):
+            piece = next(iter(pieces.values()), None)
+            if piece is None or len(pieces) < piece.count or piece.key not in self._pieces:
+                continue
+            with suppress(OSError, ValueError):  # it is tried again when a piece comes, or all are asked for anew
+                views.append(self._whole(piece))
+        return views
 
     def ask(self, key: ViewKey) -> View | None:
         """Want the view that is nearest to a stamp; returns it if it is here.
@@ -61,22 +82,36 @@ class ViewInbox:
         if key not in self.wanted:
             self._set_wanted([*self.wanted, key])
             self._pieces[key] = {}
+            self._unanswered = 0
+            self._give_up_beyond(_MOST_WANTED)
         return None
 
     def lacks(self) -> list[Lack]:
-        """Wanted views, oldest request first, as many as a message names; an image that answers two is listed once."""
+        """Wanted views, newest request first, as many as a message names; an image that answers two is listed once."""
         first: dict[ViewKey, ViewKey] = {}
         for key in self.wanted:
             first.setdefault(self._shown(key) or key, key)
-        return [Lack.of(key, self._pieces[key]) for key in list(first.values())[:MOST_VIEWS]]
+        return [Lack.of(key, self._pieces[key]) for key in list(first.values())[: -MOST_VIEWS - 1 : -1]]
+
+    def told(self) -> None:
+        """A look goes out; what an agent that is heard has not answered for very long is given up."""
+        self._unanswered += 1
+        if self._unanswered >= _MOST_LOOKS:
+            with suppress(OSError):  # a full disk: they are given up at the next look
+                self._give_up_beyond(0)
+
+    def _give_up_beyond(self, most: int) -> None:
+        for key in self.wanted[: max(len(self.wanted) - most, 0)]:
+            self._drop(key)
+            self.given_up += 1
 
     def _shown(self, key: ViewKey) -> ViewKey | None:
         """Kind, session and stamp of the image that answers a request, as far as a piece of it has said."""
-        shown = next((piece.shown_ns for piece in self._pieces[key].values()), None)
-        return None if shown is None else key._replace(stamp_ns=shown)
+        return next((_shown(piece) for piece in self._pieces[key].values()), None)
 
     def give_up(self, keys: Iterable[ViewKey]) -> int:
         """Want some no more, which the agent does not have; returns how many."""
+        self._unanswered = 0
         gone = [key for key in set(keys) if key in self.wanted]
         for key in gone:
             self._drop(key)
@@ -93,27 +128,38 @@ class ViewInbox:
             If it cannot be written; it is then still lacking.
         """
         piece = unpack_piece(data)
+        self._unanswered = 0
         key, pieces = piece.key, self._pieces.get(piece.key)
         if pieces is None:
             self.repeated += 1
             return None
-        shown = ViewKey(key.kind, key.session, piece.shown_ns)
-        if (here := self._here(shown)) is not None:  # the same image was nearest to another stamp that was asked for
+        if (
+            here := self._here(_shown(piece))
+        ) is not None:  # the same image was nearest to another stamp that was asked for
             self._drop(key)
             return here
-        if any(p.checksum != piece.checksum or p.count != piece.count for p in pieces.values()):
+        if any(_differs(piece, other) for other in pieces.values()):
             self._forget_pieces(key)  # the agent has another image than before
             pieces = self._pieces[key]
         if piece.number in pieces:
             self.repeated += 1
-            return None
-        with atomic_path(self._file(piece)) as temporary:
-            temporary.write_bytes(data)
-        pieces[piece.number] = piece
-        return self._whole(shown, piece) if len(pieces) == piece.count else None
+        else:
+            with atomic_path(self._file(piece)) as temporary:
+                temporary.write_bytes(data)
+            pieces[piece.number] = piece
+        return self._whole(piece) if len(pieces) == piece.count else None
 
-    def _whole(self, shown: ViewKey, piece: Piece) -> View:
-        """The view of all its pieces; ValueError, and all is asked for again, if they are no view."""
+    def _whole(self, piece: Piece) -> View:
+        """The view of all its pieces, which is kept.
+
+        Raises
+        ------
+        ValueError
+            If they are no view: all is asked for again. Or if there is a file that is none: it is wanted no more.
+        OSError
+            If it cannot be written: that is tried again with the next piece that comes.
+        """
+        shown = _shown(piece)
         data = b"".join(self._pieces[piece.key][n].data for n in range(piece.count))
         try:
             if zlib.crc32(data) != piece.checksum:
@@ -125,10 +171,17 @@ class ViewInbox:
             self.damaged += 1
             self._forget_pieces(piece.key)
             raise
-        self.files.add(shown, data)
+        try:
+            self.files.add(shown, data)
+        except ValueError:
+            self._drop_shown(shown)
+            raise
+        self._drop_shown(shown)
+        return view
+
+    def _drop_shown(self, shown: ViewKey) -> None:
         for key in [k for k in self.wanted if self._shown(k) == shown]:
             self._drop(key)
-        return view
 
     def _here(self, key: ViewKey) -> View | None:
         """A view that is here whole; None if it is not, or damaged."""
@@ -168,6 +221,16 @@ class ViewInbox:
     def _file(self, piece: Piece) -> Path:
         kind, session, stamp = piece.key
         return self._folder / f"{kind}-{session}-{stamp}-{piece.number}.piece"
+
+
+def _shown(piece: Piece) -> ViewKey:
+    """Kind, session and stamp of the image that a piece is of."""
+    return piece.key._replace(stamp_ns=piece.shown_ns)
+
+
+def _differs(piece: Piece, other: Piece) -> bool:
+    """True if two pieces are not of one image."""
+    return (piece.checksum, piece.count, piece.shown_ns) != (other.checksum, other.count, other.shown_ns)
 
 
 def _read_keys(path: Path) -> list[ViewKey]:
