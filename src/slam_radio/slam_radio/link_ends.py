@@ -76,7 +76,6 @@ class AgentEnd(End):
             self.node.health.count("submaps sent again")
             return
         submap = replace(submap, agent=self.name)
-        self.views.on_submap(submap)
         message = pack(submap, self.node.config.light)
         self.keep_details(self.store, key, submap, message)
         try:
@@ -84,6 +83,7 @@ class AgentEnd(End):
         except OSError as error:
             raise ValueError(f"submap {submap.index} cannot be kept for the post: {error}") from error
         self.node.health.count("submaps packed")
+        self.views.on_submap(submap)
 
     def on_odometry(self, message: Message) -> None:
         """Keep the newest pose; publish where the post's map has it."""

@@ -105,11 +105,12 @@ class AgentViews:
 
     def on_submap(self, submap: Submap) -> None:
         """Keep the images of a submap that has ended."""
-        try:
-            self.node.health.count("views kept", self.taker.end_submap(submap))
-        except OSError as error:
-            self.node.health.count("views that cannot be kept")
-            self.node.get_logger().warning(f"images of submap {submap.index} cannot be kept: {error}")
+        self.node.health.count("views kept", self.taker.end_submap(submap))
+        if reasons := self.taker.unkept:
+            self.node.health.count("views that cannot be kept", len(reasons))
+            self.node.get_logger().warning(
+                f"{len(reasons)} images of submap {submap.index} cannot be kept: {reasons[0]}"
+            )
 
     def on_look(self, _: str, data: bytes) -> None:
         """Note which views the post lacks."""

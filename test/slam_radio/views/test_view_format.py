@@ -113,12 +113,33 @@ def test_what_cannot_be_is_refused_although_the_checksum_fits(rng):
     struct.pack_into(">HH", huge, frame + JPEG_HEIGHT_AT, 60000, 60000)
     with pytest.raises(ValueError, match="not a JPEG"):
         unpack_view(pack_view(replace(view, jpeg=bytes(huge))))
+    with pytest.raises(ValueError, match="2049 x 30 px"):
+        pack_view(replace(view, size=(2049, 30)))
     with pytest.raises(ValueError, match="not a grey PNG"):
         unpack_view(pack_view(replace(view, jpeg=b"", size=(41, 30))))
     steps = view.steps.copy()
     steps[10, 10] = 0
     with pytest.raises(ValueError, match="levels"):
         unpack_view(pack_view(replace(view, steps=steps)))
+
+
+@pytest.mark.parametrize("marker", [0x01, 0xD0, 0xD7, 0xFF])
+def test_a_jpeg_that_hides_its_size_behind_a_marker_without_length_is_not_decoded(rng, monkeypatch, marker):
+    view = made(rng, PICTURE)
+    at = view.jpeg.index(b"\xff\xc0")
+    frame = view.jpeg[at : at + 20]
+    huge = bytearray(frame)
+    struct.pack_into(">HH", huge, JPEG_HEIGHT_AT, 16000, 16000)
+    hidden = bytes([0xFF, 0xD8, 0xFF, marker]) + bytes(huge)[marker == 0xFF :]  # 0xFF before a marker is a filling
+    skipped = 4 + int.from_bytes(hidden[4:6], "big")
+    hidden = hidden.ljust(skipped, b"\0") + frame
+
+    def decode(_):
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr("slam_radio.views.view_format.rgb_of", decode)
+    with pytest.raises(ValueError, match="not a JPEG of 40 x 30"):
+        unpack_view(pack_view(replace(view, jpeg=hidden)))
 
 
 def test_a_dense_key_frame_may_have_no_picture_and_a_picture_no_camera(rng):

@@ -37,9 +37,12 @@ def picture(rng):
 def test_an_image_is_kept_every_so_much_way_or_turn(taker):
     assert not taker.wants(PICTURE)  # no pose yet
     taken = []
+    small = np.zeros((12, 16, 3), dtype=np.uint8)
     for k in range(100):
         taker.set_pose(pose(0.02 * min(k, 50), np.radians(2.1) * max(k - 50, 0)))
-        taken += [k] * taker.wants(PICTURE)
+        if taker.wants(PICTURE) and taker.wants(PICTURE):  # only one that is added counts
+            taker.add_picture(k, T_BASE_CAMERA, small, None)
+            taken.append(k)
     assert taken == [0, 25, 50, 60, 70, 80, 90]
     assert taker.wants(DENSE)  # each kind has its own
 
@@ -84,6 +87,31 @@ def test_images_of_a_clock_that_began_anew_are_dropped(taker, make_submap, rng):
     assert taker.dropped == 1
     assert taker.end_submap(second) == 1
     assert taker.end_submap(first) == 0
+
+
+def test_a_picture_is_made_small_enough_to_be_sent(tmp_path, make_submap):
+    taker = ViewTaker(ViewConfig(width=2048, quality=95), ViewFiles(tmp_path / "views", 1e8))
+    submap = make_submap(5, index=3)
+    noise = np.random.default_rng(4).integers(0, 256, (2048, 2048, 3), dtype=np.uint8)
+    taker.add_picture(submap.start_stamp_ns + 1, T_BASE_CAMERA, noise, None)
+    taker.add_picture(submap.start_stamp_ns + 2, T_BASE_CAMERA, np.zeros((5000, 320, 3), dtype=np.uint8), None)
+    assert taker.end_submap(submap) == 2
+    sizes = [taker.files.read(key)[0].size for key in sorted(taker.files.sizes)]
+    assert sizes == [(2048, 2048), (80, 1250)]
+
+
+def test_an_image_that_cannot_be_kept_is_told_and_costs_no_other(taker, make_submap, rng):
+    submap = make_submap(5, index=3)
+    taker.add_picture(submap.start_stamp_ns + 1, T_BASE_CAMERA, np.zeros((5000, 1, 3), dtype=np.uint8), None)
+    stamps = [submap.start_stamp_ns + k * 10**8 for k in (1, 2)]
+    for stamp in stamps:
+        taker.add_picture(stamp, T_BASE_CAMERA, picture(rng), None)
+    (taker.files.path / f"{PICTURE}-2-{stamps[0]}.view").write_bytes(b"another")
+    assert taker.end_submap(submap) == 1
+    assert [text.rpartition(" ")[2] for text in taker.unkept] == ["be", "away"]
+    assert list(taker.files.sizes) == [ViewKey(PICTURE, 2, stamps[1])]
+    assert taker.end_submap(make_submap(5, index=4)) == 0
+    assert taker.unkept == []
 
 
 def test_the_oldest_go_when_there_are_too_many_bytes(tmp_path):

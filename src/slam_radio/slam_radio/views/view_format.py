@@ -35,9 +35,13 @@ MAGIC, VERSION = b"SV", 1
 MOST_BYTES = 2**20
 _HEAD = "<BIIqq6f"
 _CAMERA = "<HH4f"
-_MOST_PIXELS = 2048
+MOST_PIXELS = 2048
 """Largest width and height."""
 _FARTHEST_M = 1e4
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers of a JPEG with the size of the image."""
+_SEGMENTS = frozenset((0xC4, 0xCC, 0xDB, 0xDD, *range(0xE0, 0xF0), 0xFE))
+"""Markers of a JPEG that may come before it: tables, application data, comments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +89,9 @@ def pack_view(view: View) -> bytes:
     Raises
     ------
     ValueError
-        If it is too large to be sent.
+        If it has too many bytes or pixels to be sent.
     """
+    _require_size(*view.size)
     T = view.T_start_camera
     rest = struct.pack(_HEAD, view.kind, view.session, view.index, view.stamp_ns, view.start_stamp_ns,
                        *T[:3, 3], *so3_log(T[:3, :3]))  # fmt: skip
@@ -116,8 +121,7 @@ def unpack_view(data: bytes) -> View:
     jpeg = reader.bytes(reader.number("<I"))
     if kind not in KINDS or min(stamp, start) < 0:
         raise ValueError(f"a view of kind {kind} at {stamp} ns in a submap from {start} ns cannot be")
-    if not (0 < width <= _MOST_PIXELS and 0 < height <= _MOST_PIXELS):
-        raise ValueError(f"a view of {width} x {height} px cannot be")
+    _require_size(width, height)
     known = (intrinsics[:2] > 0.0).all()
     if not known and (intrinsics.any() or kind == DENSE):
         raise ValueError(f"a camera with focal lengths of {intrinsics[0]} and {intrinsics[1]} px cannot be")
@@ -141,6 +145,11 @@ def rgb_of(jpeg: bytes) -> ByteArray:
     return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
 
 
+def _require_size(width: int, height: int) -> None:
+    if not (0 < width <= MOST_PIXELS and 0 < height <= MOST_PIXELS):
+        raise ValueError(f"a view of {width} x {height} px cannot be")
+
+
 def _pose(numbers: FloatArray) -> FloatArray:
     if np.abs(numbers[:3]).max() > _FARTHEST_M or np.abs(numbers[3:]).max() > 2.0 * np.pi:
         raise ValueError(f"a pose of a view cannot be: {numbers.tolist()}")
@@ -153,15 +162,18 @@ def _pose(numbers: FloatArray) -> FloatArray:
 def _require_jpeg(data: bytes, size: tuple[int, int]) -> None:
     """Raise ``ValueError`` unless a JPEG says that it has this size and can be decoded.
 
-    The size is read first: decoding takes memory by what the file says.
+    The size is read first: decoding takes memory by what the file says. Before it only segments that have a length may
+    be: a decoder does not skip two bytes after a marker that has none.
     """
     at = 2
     while data[:2] == b"\xff\xd8" and at + 9 < len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+        if marker in _FRAMES:
             height, width = struct.unpack_from(">HH", data, at + 5)
             if (width, height) == size and rgb_of(data).shape[:2] == size[::-1]:
                 return
             break
-        at += 2 + max(length, 2)
+        if marker not in _SEGMENTS or length < 2:
+            break
+        at += 2 + length
     raise ValueError(f"not a JPEG of {size[0]} x {size[1]} px")

@@ -19,7 +19,7 @@ from slam_core.types import ByteArray, DepthImage, Submap
 from slam_radio.views.depth_code import depth_levels
 from slam_radio.views.view_config import ViewConfig
 from slam_radio.views.view_files import ViewFiles
-from slam_radio.views.view_format import View, pack_view
+from slam_radio.views.view_format import MOST_BYTES, MOST_PIXELS, View, pack_view
 from slam_radio.wire.view_messages import ViewKey
 
 _MOST_WAITING = 60
@@ -28,14 +28,21 @@ _STEP_BACK_NS = 1_000_000_000
 """Images of two cameras may come so much out of order."""
 _LARGEST_SIGMA_M = 0.12
 """Depth that is less sure is left out."""
+_PICTURE_BYTES, _COLOURS_BYTES = MOST_BYTES - 1000, MOST_BYTES // 8
+"""Largest JPEG of a picture, and of a dense key frame, whose depth takes most of what may be sent."""
+_LEAST_QUALITY = 5
 
 
 class ViewTaker:
-    """Keeps views in ``files``."""
+    """Keeps views in ``files``.
+
+    ``dropped``: images without a submap. ``unkept``: why images of the last submap could not be kept.
+    """
 
     def __init__(self, config: ViewConfig, files: ViewFiles) -> None:
         self.config, self.files = config, files
         self.dropped = 0
+        self.unkept: list[str] = []
         self._T_odom_base: FloatArray | None = None
         self._last: dict[int, FloatArray] = {}
         self._waiting: deque[View] = deque()
@@ -46,7 +53,7 @@ class ViewTaker:
         self._T_odom_base = T_odom_base
 
     def wants(self, kind: int) -> bool:
-        """True if an image is far enough from the last one of its kind; the caller then adds it."""
+        """True if an image is far enough from the last one of its kind that was added; the caller then adds it."""
         T = self._T_odom_base
         if T is None:
             return False
@@ -55,7 +62,6 @@ class ViewTaker:
             near = np.linalg.norm(moved[:3]) < self.config.distance
             if near and np.linalg.norm(moved[3:]) < np.radians(self.config.angle):
                 return False
-        self._last[kind] = T
         return True
 
     def add_picture(self, stamp_ns: int, T_base_camera: FloatArray, picture: ByteArray, camera: Camera | None) -> None:
@@ -64,7 +70,7 @@ class ViewTaker:
         height, width = small.shape[:2]
         known = camera is not None and (camera.width, camera.height) == picture.shape[1::-1]
         intrinsics = _scaled(camera, share) if camera is not None and known else (0.0, 0.0, 0.0, 0.0)
-        jpeg = encoded(small, self.config.quality)
+        jpeg = encoded(small, self.config.quality, _PICTURE_BYTES)
         self._wait(View(0, 0, stamp_ns, 0, T_base_camera, (width, height), intrinsics, jpeg))
 
     def add_depth(self, image: DepthImage, T_base_camera: FloatArray, picture: ByteArray | None) -> None:
@@ -79,11 +85,13 @@ class ViewTaker:
         jpeg = b""
         if picture is not None and picture.shape[:2] == image.depth.shape:
             small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
-            jpeg = encoded(np.asarray(small, dtype=np.uint8), self.config.quality)
+            jpeg = encoded(np.asarray(small, dtype=np.uint8), self.config.quality, _COLOURS_BYTES)
         size = width, height
         self._wait(View(0, 0, image.stamp_ns, 0, T_base_camera, size, intrinsics, jpeg, depth, steps))
 
     def _wait(self, view: View) -> None:
+        if self._T_odom_base is not None:
+            self._last[view.kind] = self._T_odom_base
         if self._waiting and view.stamp_ns < self._waiting[-1].stamp_ns - _STEP_BACK_NS:
             self.dropped += len(self._waiting)  # the clock has begun anew: their submap does not come any more
             self._waiting.clear()
@@ -95,20 +103,21 @@ class ViewTaker:
     def end_submap(self, submap: Submap) -> int:
         """Keep the images of a submap that has ended; returns how many. Those of before have none, and are dropped.
 
-        Raises
-        ------
-        OSError
-            If one cannot be written.
+        ``unkept`` has the reason for each one that is too large, or whose file cannot be written.
         """
         ready = [view for view in self._waiting if view.stamp_ns <= submap.end_stamp_ns]
         self._waiting = deque(view for view in self._waiting if view.stamp_ns > submap.end_stamp_ns)
         inside = [view for view in ready if view.stamp_ns >= submap.start_stamp_ns] if submap.path else []
         self.dropped += len(ready) - len(inside)
         path = Trajectory.from_estimates(submap.path)
+        self.unkept = []
         for view in inside:
             T_start_base = path.interpolate(np.array([view.stamp_ns]))[0]
-            self._keep(view, submap, T_start_base @ view.T_start_camera)
-        return len(inside)
+            try:
+                self._keep(view, submap, T_start_base @ view.T_start_camera)
+            except (OSError, ValueError) as error:
+                self.unkept.append(str(error))
+        return len(inside) - len(self.unkept)
 
     def _keep(self, view: View, submap: Submap, T_start_camera: FloatArray) -> None:
         placed = replace(
@@ -119,9 +128,9 @@ class ViewTaker:
 
 
 def _narrowed(picture: ByteArray, width: int) -> tuple[ByteArray, float]:
-    """The picture halved until it is no wider, and the share of its size that it has."""
+    """The picture halved until it is no wider and can be sent, and the share of its size that it has."""
     share = 1.0
-    while picture.shape[1] > width and min(picture.shape[:2]) > 1:
+    while (picture.shape[1] > width or picture.shape[0] > MOST_PIXELS) and min(picture.shape[:2]) > 1:
         size = picture.shape[1] // 2, picture.shape[0] // 2
         picture, share = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8), share / 2
     return picture, share
@@ -140,8 +149,15 @@ def _spacing(shape: tuple[int, ...], most_pixels: int) -> int:
     return step
 
 
-def encoded(picture: ByteArray, quality: int) -> bytes:
-    """A JPEG of a picture (h, w, 3), red first; grey if its channels are equal."""
+def encoded(picture: ByteArray, quality: int, most_bytes: float = np.inf) -> bytes:
+    """A JPEG of a picture (h, w, 3), red first; grey if its channels are equal.
+
+    The quality is halved, down to 5 %, until the file has no more than ``most_bytes``.
+    """
     is_grey = bool((picture[..., :1] == picture[..., 1:]).all())
-    image = picture[..., 0] if is_grey else picture[..., ::-1]
-    return bytes(cv2.imencode(".jpg", np.ascontiguousarray(image), (cv2.IMWRITE_JPEG_QUALITY, quality))[1])
+    image = np.ascontiguousarray(picture[..., 0] if is_grey else picture[..., ::-1])
+    while True:
+        data = bytes(cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, quality))[1])
+        if len(data) <= most_bytes or quality <= _LEAST_QUALITY:
+            return data
+        quality = max(quality // 2, _LEAST_QUALITY)
