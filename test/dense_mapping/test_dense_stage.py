@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dense_mapping.dense_model import DenseConfig
-from dense_mapping.dense_stage import DenseStage
+from dense_mapping.dense_stage import _MAX_WAITING, DenseStage
 from dense_room import Room
 from slam_core.geometry import OPTICAL_FROM_RIG, boxplus, invert_transform, make_transform, so3_exp
 from slam_core.messages.key_frames import AnchoredKeyFrame
@@ -156,3 +156,22 @@ def test_a_key_frame_of_the_radio_is_where_its_submap_is_and_moves_with_it(room:
     assert stage.set_path("one", Trajectory(path.stamps_ns, moved)) == 2
     for placed in stage.model.keyframes:
         np.testing.assert_allclose(placed.T_map_camera, moved[1] @ T_start_camera, atol=1e-12)
+
+
+def test_a_key_frame_of_the_radio_outlasts_a_new_session_and_may_come_again_once_dropped(room: Room) -> None:
+    stage, path = DenseStage(DenseConfig()), path_of(room, "one")
+    rng = np.random.default_rng(5)
+    frame = AnchoredKeyFrame(room.depth(3, rng), red(1), 2 * STEP_NS, T_BASE_CAMERA)
+    stage.add_anchored("one", frame)
+    stage.add("two", "tof", T_BASE_CAMERA, room.depth(2, rng))
+    stage.begin_session()  # of another agent
+    assert (stage.waiting, stage.dropped) == (1, 1)
+    image = room.depth(1, rng)
+    for _ in range(_MAX_WAITING):
+        stage.add("two", "tof", T_BASE_CAMERA, image)
+    assert (stage.waiting, stage.dropped) == (_MAX_WAITING, 2)
+    stage.set_path("one", path)
+    assert not stage.model.keyframes
+    assert stage.add_anchored("one", frame)  # asked for again
+    assert not stage.add_anchored("one", frame)
+    assert len(stage.model.keyframes) == 1

@@ -109,14 +109,20 @@ class DenseStage:
         self._odometry: dict[str, FloatArray] = {}
         self._mounts: dict[str, tuple[str, FloatArray]] = {}
         self._waiting: deque[_Waiting] = deque()
+        self._anchored: set[str] = set()
+        """Cameras of key frames of the radio that wait or are in the model."""
         self._colours: dict[str, RecentColours] = {}
         self._masks = {camera: RecentMasks() for camera in self._first_masked}
         self._forces: dict[str, deque[tuple[int, FloatArray]]] = {}
 
     def begin_session(self) -> None:
-        """The clock has begun anew: drop what waits for a pose of the old time; the model stays."""
-        self.dropped += len(self._waiting)
-        self._waiting.clear()
+        """A clock has begun anew: drop what waits for a pose of the old time; the model stays.
+
+        So do key frames of the radio, which wait for the map to have their submap.
+        """
+        still = deque(item for item in self._waiting if item.camera in self._anchored)
+        self.dropped += len(self._waiting) - len(still)
+        self._waiting = still
         self._selectors.clear()
         self._odometry.clear()
 
@@ -168,7 +174,7 @@ class DenseStage:
         if self._final is not None:
             self._place()
         elif len(self._waiting) > _MAX_WAITING:
-            self._waiting.popleft()
+            self._anchored.discard(self._waiting.popleft().camera)
             self.dropped += 1
 
     def add_pair(self, agent: str, T_base_left: FloatArray, pair: RawPair, stereo: StereoStage) -> None:
@@ -210,8 +216,9 @@ class DenseStage:
         moves the key frame with it.
         """
         camera = f"{agent}/view_{frame.image.stamp_ns}"
-        if camera in self._mounts:
+        if camera in self._anchored:
             return False
+        self._anchored.add(camera)
         image = replace(frame.image, stamp_ns=frame.start_stamp_ns)
         self.add(agent, camera.removeprefix(f"{agent}/"), frame.T_start_camera, image, frame.colours)
         return self._final is None and self._place() > 0

@@ -177,7 +177,7 @@ class Downlink:
                 if self._take_budget(data, now_s):
                     agent.looked_at_s, agent.looks = now_s, lacks
                     if lacks and agent.views is not None:
-                        agent.views.told()
+                        agent.views.count_look()
                     out.append(Message(name, "look", data))
             if agent.correction_is_due(now_s) and agent.hearing.is_up(now_s):
                 data = pack_correction(*agent.correction)  # type: ignore[misc]

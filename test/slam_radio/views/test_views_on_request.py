@@ -287,10 +287,10 @@ def test_what_an_agent_does_not_answer_for_half_an_hour_is_given_up(world):
     world.run(60.0)
     assert world.looks == 0  # it is not heard: that does not count
     for _ in range(599):
-        world.views.told()
+        world.views.count_look()
     world.views.give_up([])  # an answer
     for _ in range(599):
-        world.views.told()
+        world.views.count_look()
     assert len(world.views.wanted) == 1
     world.arrives = lambda to_post, now_s: True
     world.uplink.views.unseen = lambda: None

@@ -93,7 +93,7 @@ class ViewInbox:
             first.setdefault(self._shown(key) or key, key)
         return [Lack.of(key, self._pieces[key]) for key in list(first.values())[: -MOST_VIEWS - 1 : -1]]
 
-    def told(self) -> None:
+    def count_look(self) -> None:
         """A look goes out; what an agent that is heard has not answered for very long is given up."""
         self._unanswered += 1
         if self._unanswered >= _MOST_LOOKS:
