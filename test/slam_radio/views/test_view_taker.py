@@ -124,6 +124,42 @@ def test_the_oldest_go_when_there_are_too_many_bytes(tmp_path):
     assert len(list((tmp_path / "views").glob("*.view"))) == 3
 
 
+def test_bytes_are_counted_as_views_come_and_go(tmp_path):
+    rng = np.random.default_rng(8)
+    files = ViewFiles(tmp_path / "views", 3000.0)
+    for k in range(150):
+        key = ViewKey(int(rng.integers(1, 3)), int(rng.integers(1, 3)), int(rng.integers(1, 30)))
+        choice = rng.integers(4)
+        if key in files.sizes and choice == 0:
+            files.remove(key)
+        elif key in files.sizes and choice == 1 and files.strangers < 2:
+            files.set_aside(key)
+        elif key in files.sizes or not (files.path / f"{key.kind}-{key.session}-{key.stamp_ns}.view").exists():
+            before = set(files.sizes)
+            files.add(key, bytes(int(rng.integers(100, 400))))
+            gone = before - set(files.sizes)
+            assert all((g.session, g.stamp_ns) <= (s.session, s.stamp_ns) for g in gone for s in files.sizes)
+        on_disk = sum(file.stat().st_size for file in files.path.iterdir())
+        assert on_disk == files.bytes <= 3000, k
+    assert files.strangers == 2
+    files.close()
+    assert ViewFiles(files.path, 3000.0).bytes == on_disk
+
+
+def test_a_view_is_added_without_going_through_all_others(tmp_path):
+    class Unlisted(dict):
+        def __iter__(self):
+            raise AssertionError("all are listed")
+
+        values = items = keys = __iter__
+
+    files = ViewFiles(tmp_path / "views", 1000.0)
+    files.sizes = Unlisted()
+    for k in range(5):
+        files.add(ViewKey(PICTURE, 1, k), bytes(300))
+    assert len(files.sizes) == 3
+
+
 def test_files_of_another_version_stay_and_count(tmp_path):
     folder = tmp_path / "views"
     folder.mkdir()

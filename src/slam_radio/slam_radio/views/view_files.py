@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect_left, insort
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,7 +19,7 @@ _BEGINNING = MAGIC + bytes([VERSION])
 class ViewFiles:
     """The views of one agent: ``sizes`` has their keys, with the stamps of their images, and their bytes.
 
-    ``strangers`` counts files of another version: they stay, and count in ``most_bytes``.
+    ``strangers`` counts files of another version: they stay, and count in ``most_bytes``. ``bytes``: of all.
 
     Raises
     ------
@@ -31,7 +32,9 @@ class ViewFiles:
         self._lock = PathLock(path)
         path.mkdir(parents=True, exist_ok=True)
         self.sizes: dict[ViewKey, int] = {}
-        self.strangers, self._strange_bytes = 0, 0
+        self.strangers, self.bytes = 0, 0
+        self._by_age: list[tuple[int, int, int]] = []
+        """Session, stamp and kind of every key, oldest first."""
         for file in sorted(path.iterdir()):
             if match := _NAME.fullmatch(file.name):
                 self._find(file, ViewKey(int(match[1]), int(match[2]), int(match[3])))
@@ -39,11 +42,21 @@ class ViewFiles:
     def _find(self, file: Path, key: ViewKey) -> None:
         with file.open("rb") as stream:
             is_ours = stream.read(len(_BEGINNING)) == _BEGINNING
+        size = file.stat().st_size
+        self.bytes += size
         if is_ours:
-            self.sizes[key] = file.stat().st_size
+            self._note(key, size)
         else:
             self.strangers += 1
-            self._strange_bytes += file.stat().st_size
+
+    def _note(self, key: ViewKey, size: int) -> None:
+        self.sizes[key] = size
+        insort(self._by_age, _age(key))
+
+    def _forget(self, key: ViewKey) -> int:
+        """Bytes of a view that is looked at no more."""
+        del self._by_age[bisect_left(self._by_age, _age(key))]
+        return self.sizes.pop(key)
 
     def add(self, key: ViewKey, data: bytes) -> None:
         """Keep a view, whole or not at all, and forget the oldest beyond the limit; OSError if that fails."""
@@ -52,13 +65,13 @@ class ViewFiles:
             raise ValueError(f"{file} is not a view of this program: move it away")
         with atomic_path(file) as temporary:
             temporary.write_bytes(data)
-        self.sizes[key] = len(data)
-        total = self._strange_bytes + sum(self.sizes.values())
-        for old in sorted(self.sizes, key=lambda k: (k.session, k.stamp_ns)):
-            if total <= self._most_bytes:
-                return
-            total -= self.sizes[old]
-            self.remove(old)
+        if key in self.sizes:
+            self.bytes -= self._forget(key)
+        self._note(key, len(data))
+        self.bytes += len(data)
+        while self.bytes > self._most_bytes and self._by_age:
+            session, stamp, kind = self._by_age[0]
+            self.remove(ViewKey(kind, session, stamp))
 
     def nearest(self, key: ViewKey, within_ns: int) -> ViewKey | None:
         """Key of the view of a kind and session whose image is nearest to a stamp; None if none is near."""
@@ -76,14 +89,14 @@ class ViewFiles:
 
     def set_aside(self, key: ViewKey) -> None:
         """Look at a file that cannot be read no more; it stays, if there is one."""
-        size = self.sizes.pop(key)
+        self.bytes -= self._forget(key)
         self.strangers += 1
         with suppress(FileNotFoundError):
-            self._strange_bytes += min(size, self._file(key).stat().st_size)
+            self.bytes += self._file(key).stat().st_size
 
     def remove(self, key: ViewKey) -> None:
         """Remove a view that is there."""
-        del self.sizes[key]
+        self.bytes -= self._forget(key)
         self._file(key).unlink(missing_ok=True)
 
     def close(self) -> None:
@@ -92,3 +105,7 @@ class ViewFiles:
 
     def _file(self, key: ViewKey) -> Path:
         return self.path / f"{key.kind}-{key.session}-{key.stamp_ns}.view"
+
+
+def _age(key: ViewKey) -> tuple[int, int, int]:
+    return key.session, key.stamp_ns, key.kind
