@@ -38,7 +38,8 @@ from slam_radio.views.view_taker import ViewTaker
 from slam_radio.wire.view_messages import ViewKey, unpack_look, unpack_unseen
 
 _PICTURES = ("stereo/left/image_rect_color", "stereo/left/image_rect", "tof/color/image")
-"""Topics of pictures: one that is heard puts those after it out of use."""
+"""Topics of pictures: one that is heard puts those after it out of use, until it is silent."""
+_SILENT_NS = 2_000_000_000
 _DEPTH = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
 _INFOS = {"stereo": "stereo/left/camera_info", "tof": "tof/camera_info"}
 WANTED = {PICTURE: "wanted_picture", DENSE: "wanted_key_frame"}
@@ -63,7 +64,8 @@ class AgentViews:
         if self.files.strangers:
             end.tell_strangers({folder: self.files.strangers}, "sent")
         self._cameras: dict[str, Camera] = {}
-        self._rank = len(_PICTURES)
+        self._heard: dict[int, int] = {}
+        """Newest stamp (ns) of a topic of pictures, by its place among them."""
         self._colours: Message | None = None
         end.hear(f"slam/{agent}/look", self.on_look)
         if config.views.megabytes > 0.0:
@@ -81,13 +83,12 @@ class AgentViews:
         sensor = _PICTURES[rank].split("/")[0]
         if sensor == "tof":
             self._colours = message
-        self._rank = min(rank, self._rank)
-        if rank > self._rank or not self.taker.wants(PICTURE):
+        stamp = self._heard[rank] = stamp_ns(message)
+        has_better = any(other < rank and abs(stamp - t) <= _SILENT_NS for other, t in self._heard.items())
+        if has_better or not self.taker.wants(PICTURE):
             return
         T_base_camera = self._mount(message)
-        self.taker.add_picture(
-            stamp_ns(message), T_base_camera, colour_from_message(message), self._cameras.get(sensor)
-        )
+        self.taker.add_picture(stamp, T_base_camera, colour_from_message(message), self._cameras.get(sensor))
 
     def on_depth(self, depth: Message, noise: Message, info: Message) -> None:
         """Keep a depth image, if it is due, with its colours where they have come."""
@@ -139,7 +140,8 @@ class PostViews:
         config, folder = self.node.config, self.node.state_folder / "asked_views"  # an agent of this state has "views"
         self.inboxes = {a: ViewInbox(a, folder / a, 1e6 * config.views.megabytes) for a in agents}
         self._paths: dict[str, Trajectory] = {}
-        self._submaps: dict[str, dict[tuple[int, int], tuple[int, int]]] = {a: {} for a in self.inboxes}
+        self._submaps: dict[str, dict[tuple[int, int], tuple[int, int, frozenset[int]]]] = {a: {} for a in self.inboxes}
+        """First and last stamp of each submap, and those of the poses of its path, ns."""
         for agent, inbox in self.inboxes.items():
             if inbox.files.strangers:
                 end.tell_strangers({inbox.files.path: inbox.files.strangers}, "shown")
@@ -154,7 +156,8 @@ class PostViews:
 
     def on_submap(self, agent: str, submap: Submap) -> None:
         """Note the time of a submap."""
-        self._submaps[agent][submap.session, submap.index] = submap.start_stamp_ns, submap.end_stamp_ns
+        stamps = frozenset(pose.stamp_ns for pose in submap.path)
+        self._submaps[agent][submap.session, submap.index] = submap.start_stamp_ns, submap.end_stamp_ns, stamps
 
     def on_path(self, agent: str, message: Message) -> None:
         """Keep where an agent was by the map."""
@@ -171,22 +174,36 @@ class PostViews:
         """
         frame = message.header.frame_id
         if frame in self.inboxes:
-            agent, stamp = frame, stamp_ns(message) or max((end for _, end in self._submaps[frame].values()), default=0)
+            agent, stamp = (
+                frame,
+                stamp_ns(message) or max((end for _, end, _ in self._submaps[frame].values()), default=0),
+            )
         elif frame == self.node.config.map_frame:
             agent, stamp = moment_of(self._paths, np.array([message.point.x, message.point.y, message.point.z]))
         else:
             raise ValueError(
                 f"a place is wanted in the frame '{self.node.config.map_frame}', or of an agent: '{frame}'"
             )
-        at = [key for key, (start, end) in self._submaps[agent].items() if start <= stamp <= end]
-        if not at:
-            raise ValueError(f"no submap of {agent} has come that was made at {stamp * 1e-9:.3f} s")
-        view = self.inboxes[agent].ask(ViewKey(kind, max(at)[0], stamp))
+        view = self.inboxes[agent].ask(ViewKey(kind, self._session_at(agent, stamp), stamp))
         self.node.health.count("views asked for")
         outcome = "asked for" if view is None else "is here"
         self.node.get_logger().info(f"{KINDS[kind]} of {agent} at {stamp * 1e-9:.3f} s {outcome}")
         if view is not None:
             self.publish(agent, view)
+
+    def _session_at(self, agent: str, stamp: int) -> int:
+        """Session of a stamp: of several whose clocks overlap that with a pose of just this stamp, else the newest.
+
+        Raises
+        ------
+        ValueError
+            If no submap has come of this time.
+        """
+        at = [(stamp in poses, session) for (session, _), (start, end, poses) in self._submaps[agent].items()
+              if start <= stamp <= end]  # fmt: skip
+        if not at:
+            raise ValueError(f"no submap of {agent} has come that was made at {stamp * 1e-9:.3f} s")
+        return max(at)[1]
 
     def on_piece(self, agent: str, view: View | None) -> None:
         """Publish a view that is whole."""

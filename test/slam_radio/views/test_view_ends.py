@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from slam_bags.storage.bag_types import BagTypes
 from slam_core.camera import Camera
 from slam_core.health import Health
-from slam_core.messages import depth_messages, header_message, image_message, submap_messages
+from slam_core.messages import depth_messages, header_message, image_message, path_message, submap_messages
 from slam_core.types import DepthImage
 from slam_radio.link_end import End
 from slam_radio.link_ends import AgentEnd
@@ -140,3 +141,45 @@ def test_an_image_without_a_mounting_does_not_cost_the_next_one(node):
     assert not views.taker.wants(PICTURE)
     assert not views.taker.wants(DENSE)
     views.close()
+
+
+def test_grey_pictures_are_taken_while_the_colour_camera_is_silent(node):
+    views = AgentViews(End(node), AGENT)
+    views.on_pose(np.eye(4))
+    taken = []
+    views.taker.add_picture = lambda stamp_ns, *_: taken.append(stamp_ns)
+    colour, grey, _ = range(3)
+    for rank, seconds in ((colour, 1), (grey, 1), (grey, 2), (grey, 3), (grey, 4), (colour, 5), (grey, 5)):
+        views.on_picture(rank, image(node, seconds * 10**9))
+    assert taken == [1 * 10**9, 4 * 10**9, 5 * 10**9]
+    views.close()
+
+
+def point(node, frame, seconds=0):
+    header = header_message(node.types, seconds * 10**9, frame)
+    return node.types.PointStamped(header=header, point=node.types.Point(x=0.0, y=0.0, z=0.0))
+
+
+def test_a_place_of_an_earlier_session_is_asked_of_that_session(node, make_submap):
+    """Clocks of both began at 0: submaps overlap, and the stamp of the pose that saw the place tells them apart."""
+    post = PostViews(End(node), [AGENT])
+    first = make_submap(5, index=0, agent=AGENT)
+    later = tuple(replace(pose, stamp_ns=pose.stamp_ns + 10**8) for pose in first.path)
+    start, end = first.start_stamp_ns, first.end_stamp_ns
+    second = replace(
+        first, session=first.session + 1, path=later, start_stamp_ns=start + 10**8, end_stamp_ns=end + 10**8
+    )
+    for submap in (first, second):
+        post.on_submap(AGENT, submap)
+    seen = first.path[1]
+    post.on_path(AGENT, path_message(node.types, end, "map", [seen]))
+    post.on_wanted(PICTURE, point(node, "map"))
+    post.on_wanted(DENSE, point(node, AGENT))
+    inbox = post.inboxes[AGENT]
+    assert inbox.wanted == [
+        ViewKey(PICTURE, first.session, seen.stamp_ns),
+        ViewKey(DENSE, second.session, second.end_stamp_ns),
+    ]
+    with pytest.raises(ValueError, match="no submap of anna"):
+        post.on_wanted(PICTURE, point(node, AGENT, 1000))
+    post.close()
