@@ -37,7 +37,8 @@ from slam_radio.views.view_sender import ViewSender
 from slam_radio.views.view_taker import ViewTaker
 from slam_radio.wire.view_messages import ViewKey, unpack_look, unpack_unseen
 
-_PICTURES = ("stereo/left/image_rect_color", "stereo/left/image_rect", "tof/color/image")
+_COLOURS = "stereo/left/image_rect_color"
+_PICTURES = (_COLOURS, "stereo/left/image_rect", "tof/color/image")
 """Topics of pictures: one that is heard puts those after it out of use, until it is silent."""
 _SILENT_NS = 2_000_000_000
 _DEPTH = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
@@ -70,6 +71,8 @@ class AgentViews:
         end.hear(f"slam/{agent}/look", self.on_look)
         if config.views.megabytes > 0.0:
             for rank, topic in enumerate(_PICTURES):
+                if topic == _COLOURS and not config.views.colours:
+                    continue  # a driver that nobody hears does not make them
                 self.node.listen(topic, "Image", partial(self.on_picture, rank), **_ANY)
             self.node.listen(_INFOS["stereo"], "CameraInfo", self.on_info, **_ANY)
             self.node.listen_together(_DEPTH, self.on_depth, **_ANY)

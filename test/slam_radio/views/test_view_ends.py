@@ -35,10 +35,10 @@ class Node:
         light = LightConfig(landmarks=5, rank=1)
         self.config = RadioConfig(agents=(AGENT,), light=light, views=ViewConfig(**views))
         self.state_folder, self.health, self.types, self.link = folder, Health(), BagTypes(), self
-        self.published, self.said, self.frames = Counter(), [], {"left": np.eye(4)}
+        self.heard, self.published, self.said, self.frames = [], Counter(), [], {"left": np.eye(4)}
 
-    def listen(self, *args, **more):
-        pass
+    def listen(self, topic, *args, **more):
+        self.heard.append(topic)
 
     listen_together = advertise = serve = listen
 
@@ -141,6 +141,14 @@ def test_an_image_without_a_mounting_does_not_cost_the_next_one(node):
     assert not views.taker.wants(PICTURE)
     assert not views.taker.wants(DENSE)
     views.close()
+
+
+@pytest.mark.parametrize("colours", [True, False])
+def test_colours_are_heard_only_if_they_are_wanted(tmp_path, colours):
+    node = Node(tmp_path, colours=colours)
+    AgentViews(End(node), AGENT).close()
+    assert ("stereo/left/image_rect_color" in node.heard) == colours
+    assert {"stereo/left/image_rect", "tof/color/image"} < {topic for topic in node.heard if isinstance(topic, str)}
 
 
 def test_grey_pictures_are_taken_while_the_colour_camera_is_silent(node):

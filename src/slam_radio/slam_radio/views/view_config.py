@@ -18,6 +18,10 @@ class ViewConfig(Config):
     )  # fmt: skip
     distance: float = parameter(0.5, "an image is kept every so much way", unit="m", minimum=0.05)
     angle: float = parameter(20.0, "and from so much turn on", unit="deg", minimum=2.0, maximum=180.0)
+    colours: bool = parameter(
+        True, "pictures of the left camera are in colour where it has colours: its driver rectifies all for that; "
+        "off: they are grey"
+    )  # fmt: skip
     width: int = parameter(320, "pictures are halved until they are no wider", unit="px", minimum=32, maximum=2048)
     quality: int = parameter(40, "quality of the JPEG of a picture", unit="%", minimum=5, maximum=95)
     depth_pixels: int = parameter(
