@@ -29,8 +29,8 @@ from problems import ring  # noqa: E402 - sets the import path
 from std_srvs.srv import Trigger  # noqa: E402
 
 from ros_probe import Probe  # noqa: E402
-from sjsam_node import storage  # noqa: E402
 from sjsam_node.global_map import GlobalMap  # noqa: E402
+from sjsam_node.map_file import storage  # noqa: E402
 from slam_core.messages import odometry_message  # noqa: E402
 from slam_core.types import PoseEstimate  # noqa: E402
 
