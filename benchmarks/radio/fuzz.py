@@ -23,7 +23,7 @@ from slam_core.geometry import FloatArray
 from slam_core.types import Submap
 from slam_radio.packing.light_submap import ENVELOPE, LightConfig, pack, sealed, unpack
 from slam_radio.views.depth_code import depth_levels
-from slam_radio.views.view_format import View, pack_view, rgb_of, unpack_view
+from slam_radio.views.view_format import PlacedImage, pack_view, rgb_of, unpack_view
 from slam_radio.views.view_taker import encoded
 from slam_radio.wire.view_messages import (
     Lack,
@@ -79,7 +79,7 @@ def read_submap(data: bytes) -> Submap:
     return submap
 
 
-def read_view(data: bytes) -> View:
+def read_view(data: bytes) -> PlacedImage:
     """Unpack a view; one that is accepted has to be one."""
     view = unpack_view(data)
     require_finite(view.T_start_camera, "a view's pose")
@@ -98,8 +98,8 @@ def views(rng: np.random.Generator) -> list[tuple[str, list[bytes], Callable[[by
     pixels = np.kron(rng.integers(0, 256, (6, 8, 3)), np.ones((8, 8, 1))).astype(np.uint8)
     depth = np.linspace(0.5, 4.0, 48 * 64, dtype=np.float32).reshape(48, 64)
     levels, steps = depth_levels(depth, 0.01 * depth)
-    shot = View(1, 2, 10**9, 10**8, np.eye(4), (64, 48), (50.0, 50.0, 31.5, 23.5), encoded(pixels, 40))
-    dense = View(1, 2, 10**9, 10**8, np.eye(4), (64, 48), shot.intrinsics, shot.jpeg, levels, steps)
+    shot = PlacedImage(1, 2, 10**9, 10**8, np.eye(4), (64, 48), (50.0, 50.0, 31.5, 23.5), encoded(pixels, 40))
+    dense = PlacedImage(1, 2, 10**9, 10**8, np.eye(4), (64, 48), shot.intrinsics, shot.jpeg, levels, steps)
     packed, key = [pack_view(shot), pack_view(dense)], ViewKey(1, 2, 10**9)
     pieces = [pack_piece(piece) for data in packed for piece in pieces_of(key, 10**9, data)]
     lacks = [pack_look([Lack(key, k, 5 * k), Lack(key)]) for k in range(4)]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from slam_simulation import Scenario
-from slam_simulation.lift import LiftPath, Ride, seen_path
+from slam_simulation.lift import LiftPath, LiftRide, seen_path
 from slam_simulation.sensors.imu import ideal_reading
 from slam_simulation.sensors.pressure import PressureSensor, PressureSensorConfig
 
-RIDE = Ride(at=4, height=9.0, seconds=9.0, wait=1.5)
+RIDE = LiftRide(at=4, height=9.0, seconds=9.0, wait=1.5)
 
 
 def path() -> LiftPath:
@@ -63,12 +63,12 @@ def test_a_barometer_tells_the_height() -> None:
 @pytest.mark.parametrize(
     ("rides", "message"),
     [
-        ((Ride(0 + 1, 9.0), Ride(1, 3.0)), "ascending"),
-        ((Ride(9, 9.0),), "inner"),
-        ((Ride(4, 9.0, seconds=80.0),), "rides take"),
+        ((LiftRide(0 + 1, 9.0), LiftRide(1, 3.0)), "ascending"),
+        ((LiftRide(9, 9.0),), "inner"),
+        ((LiftRide(4, 9.0, seconds=80.0),), "rides take"),
     ],
 )
-def test_rides_that_cannot_be_are_refused(rides: tuple[Ride, ...], message: str) -> None:
+def test_rides_that_cannot_be_are_refused(rides: tuple[LiftRide, ...], message: str) -> None:
     scenario = Scenario.load("lift")
     agent = replace(scenario.agents[0], rides=rides)
     with pytest.raises(ValueError, match=message):
@@ -77,4 +77,4 @@ def test_rides_that_cannot_be_are_refused(rides: tuple[Ride, ...], message: str)
 
 def test_a_ride_needs_a_way_point_and_time() -> None:
     with pytest.raises(ValueError, match="at >= 1"):
-        Ride(0, 9.0)
+        LiftRide(0, 9.0)

@@ -14,7 +14,7 @@ from slam_core.types import PoseEstimate, Submap
 from slam_radio.link_state import Hearing, LinkState
 from slam_radio.queues.byte_budget import OVERHEAD, ByteBudget
 from slam_radio.queues.inbox import Inbox
-from slam_radio.views.view_format import View
+from slam_radio.views.view_format import PlacedImage
 from slam_radio.views.view_inbox import ViewInbox
 from slam_radio.wire.index_ranges import Key, Range
 from slam_radio.wire.link_report import Backlog, LinkReport, unpack_backlog
@@ -128,7 +128,7 @@ class Downlink:
         agent.hearing.heard(now_s)
         return agent.inbox.give_up(ranges)
 
-    def on_piece(self, name: str, data: bytes, now_s: float) -> View | None:
+    def on_piece(self, name: str, data: bytes, now_s: float) -> PlacedImage | None:
         """Take a piece of a view; returns the view if it is whole. Raises as :meth:`ViewInbox.take`."""
         agent = self._agents[name]
         assert agent.views is not None

@@ -31,7 +31,7 @@ from slam_radio.link_end import End
 from slam_radio.views.depth_code import depth_of_levels
 from slam_radio.views.places import moment_of
 from slam_radio.views.view_files import ViewFiles
-from slam_radio.views.view_format import DENSE, KINDS, PICTURE, View, rgb_of
+from slam_radio.views.view_format import DENSE, KINDS, PICTURE, PlacedImage, rgb_of
 from slam_radio.views.view_inbox import ViewInbox
 from slam_radio.views.view_sender import ViewSender
 from slam_radio.views.view_taker import ViewTaker
@@ -208,7 +208,7 @@ class PostViews:
             raise ValueError(f"no submap of {agent} has come that was made at {stamp * 1e-9:.3f} s")
         return max(at)[1]
 
-    def on_piece(self, agent: str, view: View | None) -> None:
+    def on_piece(self, agent: str, view: PlacedImage | None) -> None:
         """Publish a view that is whole."""
         self.node.health.count("pieces received")
         if view is not None:
@@ -221,7 +221,7 @@ class PostViews:
             self.node.health.count("views that agents do not have", count)
             self.node.get_logger().warning(f"{agent} has no image of {count} of the moments that were asked for")
 
-    def publish(self, agent: str, view: View) -> None:
+    def publish(self, agent: str, view: PlacedImage) -> None:
         """Publish a view: for the page with its pose in the map as it is now, for the dense model with its submap."""
         types = self.node.types
         header = header_message(types, view.stamp_ns, agent)
@@ -260,7 +260,7 @@ class PostViews:
             inbox.close()
 
 
-def key_frame_of(view: View, agent: str) -> AnchoredKeyFrame:
+def key_frame_of(view: PlacedImage, agent: str) -> AnchoredKeyFrame:
     """The depth image of a view that has one, with its colours, or grey."""
     assert view.depth is not None
     assert view.steps is not None

@@ -21,7 +21,7 @@ _SPEED_UP_SHARE = 0.25
 
 
 @dataclass(frozen=True)
-class Ride:
+class LiftRide:
     """A ride while the agent stands at way point ``at`` (number of its path, neither end).
 
     ``height`` m up, or down if negative, within ``seconds``, the rig having stood for ``wait`` s before and after.
@@ -64,7 +64,7 @@ class LiftPath:
     def __init__(
         self,
         waypoints: FloatArray,
-        rides: tuple[Ride, ...],
+        rides: tuple[LiftRide, ...],
         duration: float,
         style: MotionStyle,
         rng: np.random.Generator,

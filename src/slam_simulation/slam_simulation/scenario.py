@@ -38,7 +38,7 @@ import numpy as np
 from slam_core.config import Config, from_mapping, group, parameter
 from slam_core.geometry import FloatArray, make_transform, rotation_from_euler
 from slam_core.storage.files import read_yaml
-from slam_simulation.lift import LiftPath, Ride
+from slam_simulation.lift import LiftPath, LiftRide
 from slam_simulation.sensors.imu import ImuSensorConfig
 from slam_simulation.sensors.position import PositionSensorConfig
 from slam_simulation.sensors.pressure import PressureSensorConfig
@@ -73,10 +73,10 @@ class Agent:
     stations: tuple[tuple[float, ...], ...] = ()
     scans: int = 15
     start_s: float = 0.0
-    rides: tuple[Ride, ...] = ()
+    rides: tuple[LiftRide, ...] = ()
 
     def __post_init__(self) -> None:
-        rides = tuple(ride if isinstance(ride, Ride) else _make(Ride, ride, self.name) for ride in self.rides)
+        rides = tuple(ride if isinstance(ride, LiftRide) else _make(LiftRide, ride, self.name) for ride in self.rides)
         object.__setattr__(self, "rides", rides)
         if self.rides and self.stations:
             raise ValueError(f"agent '{self.name}' rides along a path, not from station to station")

@@ -21,7 +21,7 @@ from slam_radio.packing.light_submap import LightConfig
 from slam_radio.radio_config import RadioConfig
 from slam_radio.view_ends import AgentViews, PostViews
 from slam_radio.views.view_config import ViewConfig
-from slam_radio.views.view_format import DENSE, PICTURE, View, pack_view
+from slam_radio.views.view_format import DENSE, PICTURE, PlacedImage, pack_view
 from slam_radio.views.view_taker import encoded
 from slam_radio.wire.view_messages import ViewKey, pack_piece, pieces_of
 
@@ -66,7 +66,7 @@ def node(tmp_path):
 
 def picture(stamp_ns, session=2):
     pixels = np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)
-    return View(session, 0, stamp_ns, 0, np.eye(4), (64, 64), (0.0, 0.0, 0.0, 0.0), encoded(pixels, 80))
+    return PlacedImage(session, 0, stamp_ns, 0, np.eye(4), (64, 64), (0.0, 0.0, 0.0, 0.0), encoded(pixels, 80))
 
 
 def image(node, stamp_ns, frame="left"):

@@ -12,7 +12,7 @@ import pytest
 from slam_core.geometry import boxplus
 from slam_radio.packing.light_submap import ENVELOPE, sealed
 from slam_radio.views.depth_code import FARTHEST_M, depth_levels, depth_of_levels
-from slam_radio.views.view_format import DENSE, MAGIC, PICTURE, VERSION, View, pack_view, rgb_of, unpack_view
+from slam_radio.views.view_format import DENSE, MAGIC, PICTURE, VERSION, PlacedImage, pack_view, rgb_of, unpack_view
 from slam_radio.views.view_taker import encoded
 from slam_radio.wire.view_messages import (
     Lack,
@@ -41,7 +41,7 @@ def depth_image(rng, height=30, width=40):
 
 def made(rng, kind=DENSE):
     jpeg = encoded(rng.integers(0, 256, (30, 40, 3), dtype=np.uint8), 50)
-    view = View(3, 7, 5 * 10**9, 4 * 10**9, T, (40, 30), (33.0, 34.0, 19.5, 14.5), jpeg)
+    view = PlacedImage(3, 7, 5 * 10**9, 4 * 10**9, T, (40, 30), (33.0, 34.0, 19.5, 14.5), jpeg)
     if kind == PICTURE:
         return view
     depth, steps = depth_levels(*depth_image(rng))
@@ -86,7 +86,7 @@ def test_damage_is_refused(rng):
             unpack_view(data[: rng.integers(len(data))])
 
 
-def forged(view: View, at: int, form: str, *numbers) -> bytes:
+def forged(view: PlacedImage, at: int, form: str, *numbers) -> bytes:
     rest = bytearray(pack_view(view)[ENVELOPE.size :])
     struct.pack_into(form, rest, at, *numbers)
     return sealed(MAGIC, VERSION, bytes(rest))

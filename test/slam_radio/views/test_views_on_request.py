@@ -8,7 +8,7 @@ import pytest
 from radio_world import World
 
 from slam_radio.queues.byte_budget import OVERHEAD
-from slam_radio.views.view_format import DENSE, PICTURE, View, pack_view
+from slam_radio.views.view_format import DENSE, PICTURE, PlacedImage, pack_view
 from slam_radio.views.view_taker import encoded
 from slam_radio.wire.view_messages import (
     PIECE_BYTES,
@@ -28,10 +28,10 @@ def world(tmp_path, make_submap):
     return World(tmp_path, make_submap)
 
 
-def picture(stamp_ns: int, side: int = 64, seed: int = 1) -> View:
+def picture(stamp_ns: int, side: int = 64, seed: int = 1) -> PlacedImage:
     """A picture of noise: about one byte a pixel."""
     pixels = np.random.default_rng(seed).integers(0, 256, (side, side, 3), dtype=np.uint8)
-    return View(SESSION, 0, stamp_ns, 0, np.eye(4), (side, side), (0.0, 0.0, 0.0, 0.0), encoded(pixels, 80))
+    return PlacedImage(SESSION, 0, stamp_ns, 0, np.eye(4), (side, side), (0.0, 0.0, 0.0, 0.0), encoded(pixels, 80))
 
 
 def keep(world: World, stamp_ns: int, **more) -> int:
@@ -41,7 +41,7 @@ def keep(world: World, stamp_ns: int, **more) -> int:
     return -(-len(data) // PIECE_BYTES)
 
 
-def ask(world: World, stamp_ns: int, kind: int = PICTURE) -> View | None:
+def ask(world: World, stamp_ns: int, kind: int = PICTURE) -> PlacedImage | None:
     return world.views.ask(ViewKey(kind, SESSION, stamp_ns))
 
 

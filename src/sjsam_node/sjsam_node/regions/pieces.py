@@ -25,7 +25,7 @@ from slam_core.linear_algebra.block_pattern import IntArray, pointers
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class RegionPiece:
     """One task's part of the problem.
 
     region: the region over local numbers of maps and variables; maps: its local maps over the local poses and
@@ -77,24 +77,24 @@ class Eliminated:
 # -- tasks: pure functions ---------------------------------------------------------------------------------------------
 
 
-def eliminate_piece(piece: Piece, state: JoiningState, damping: float) -> Eliminated:
+def eliminate_piece(piece: RegionPiece, state: JoiningState, damping: float) -> Eliminated:
     """Eliminate a region and all inside it."""
     return _eliminate_inside(piece, piece.region, state, damping)
 
 
-def reduce_piece(piece: Piece, state: JoiningState, damping: float) -> Reduced:
+def reduce_piece(piece: RegionPiece, state: JoiningState, damping: float) -> Reduced:
     """Eliminate a region and all inside it; only what is left for the parent is returned."""
     return eliminate_piece(piece, state, damping).reduced
 
 
 def eliminated_again(
-    inside: Callable[..., FloatArray], piece: Piece, state: JoiningState, damping: float, separator: FloatArray
+    inside: Callable[..., FloatArray], piece: RegionPiece, state: JoiningState, damping: float, separator: FloatArray
 ) -> FloatArray:
     """Result of ``inside`` for a piece that is eliminated once more."""
     return inside(piece, eliminate_piece(piece, state, damping), separator)
 
 
-def _eliminate_inside(piece: Piece, region: MapRegion, state: JoiningState, damping: float) -> Eliminated:
+def _eliminate_inside(piece: RegionPiece, region: MapRegion, state: JoiningState, damping: float) -> Eliminated:
     width = piece.items.width
     children = tuple(_eliminate_inside(piece, child, state, damping) for child in region.children)
     start = pointers(width[region.variables])
@@ -120,7 +120,7 @@ def eliminate_above(own: int, size: int, places: tuple[IntArray, ...], *parts: R
     return Eliminated(front, reduced)
 
 
-def step_inside(piece: Piece, eliminated: Eliminated, separator: FloatArray) -> FloatArray:
+def step_inside(piece: RegionPiece, eliminated: Eliminated, separator: FloatArray) -> FloatArray:
     """Step (n,) of all variables inside a task's region, one after the other as the piece has them."""
     start = pointers(piece.items.width)
     out = np.zeros(int(start[-1]))
@@ -140,7 +140,7 @@ def step_above(front: Front, separator: FloatArray) -> FloatArray:
     return np.concatenate([substitute(front, separator), separator])
 
 
-def blocks_inside(piece: Piece, eliminated: Eliminated, separator: FloatArray) -> FloatArray:
+def blocks_inside(piece: RegionPiece, eliminated: Eliminated, separator: FloatArray) -> FloatArray:
     """Covariance of each variable inside a task's region, (v, 6, 6), filled with zeros."""
     width = piece.items.width
     out = np.zeros((len(width), 6, 6))
@@ -205,7 +205,7 @@ def _runs(ptr: IntArray, chosen: IntArray) -> IntArray:
     return np.asarray(np.repeat(ptr[chosen] - pointers(counts)[:-1], counts) + np.arange(int(counts.sum())))
 
 
-def piece_of(model: int, region: MapRegion, maps: FlatMaps, every: Variables) -> Piece:
+def piece_of(model: int, region: MapRegion, maps: FlatMaps, every: Variables) -> RegionPiece:
     """A region with all that its task needs, numbered by itself."""
     poses_at, landmarks_at = _runs(maps.pose_ptr, region.maps), _runs(maps.landmark_ptr, region.maps)
     means, values = _runs(maps.mean_ptr, region.maps), _runs(maps.information_ptr, region.maps)
@@ -222,7 +222,7 @@ def piece_of(model: int, region: MapRegion, maps: FlatMaps, every: Variables) ->
     counts = np.diff(every.item_ptr)[region.maps]
     items = np.searchsorted(variables, every.items[_runs(every.item_ptr, region.maps)])
     inside = Variables(len(poses), every.width[variables], every.known[variables], pointers(counts), items)
-    return Piece(model, _renumbered(region, region.maps, variables), own, inside, poses, landmarks)
+    return RegionPiece(model, _renumbered(region, region.maps, variables), own, inside, poses, landmarks)
 
 
 def _renumbered(region: MapRegion, maps: IntArray, variables: IntArray) -> MapRegion:

@@ -23,7 +23,7 @@ import numpy as np
 from sjsam_node.joint_problem.problem import FlatMaps, JoiningState
 from sjsam_node.regions.dissection import LEAF_MAPS, MapRegion, Variables, dissect
 from sjsam_node.regions.pieces import (
-    Piece,
+    RegionPiece,
     blocks_inside,
     covariance_above,
     eliminate_above,
@@ -94,7 +94,7 @@ class RegionTree:
         self.start = pointers(self.variables.width)
         self.root = dissect(self.variables, state.translations[maps.reference], leaf_maps)
         self._nodes: list[_Node] = []
-        self._pieces: list[Piece] = []
+        self._pieces: list[RegionPiece] = []
         self._add(self.root, maps, model, task_maps)
         self._held = [self._tasks.hold(piece) for piece in self._pieces]
         self._keeps = len(maps.reference) <= kept_maps

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from slam_core.storage.files import PathLock, atomic_path, read_bytes
-from slam_radio.views.view_format import KINDS, MAGIC, MOST_BYTES, VERSION, View, unpack_view
+from slam_radio.views.view_format import KINDS, MAGIC, MOST_BYTES, VERSION, PlacedImage, unpack_view
 from slam_radio.wire.view_messages import ViewKey
 
 _NAME = re.compile(r"([12])-(\d{1,10})-(\d{1,19})\.view")
@@ -79,7 +79,7 @@ class ViewFiles:
         best = min(same, key=lambda k: (abs(k.stamp_ns - key.stamp_ns), k.stamp_ns), default=None)
         return best if best is not None and abs(best.stamp_ns - key.stamp_ns) <= within_ns else None
 
-    def read(self, key: ViewKey) -> tuple[View, bytes]:
+    def read(self, key: ViewKey) -> tuple[PlacedImage, bytes]:
         """A view and its bytes; ValueError or OSError if its file is damaged, gone, or holds another one."""
         data = read_bytes(self._file(key), MOST_BYTES)
         view = unpack_view(data)

@@ -45,7 +45,7 @@ _SEGMENTS = frozenset((0xC4, 0xCC, 0xDB, 0xDD, *range(0xE0, 0xF0), 0xFE))
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PlacedImage:
     """A picture (``depth`` and ``steps`` None) or a dense key frame of one moment.
 
     Attributes
@@ -83,7 +83,7 @@ class View:
         return PICTURE if self.depth is None else DENSE
 
 
-def pack_view(view: View) -> bytes:
+def pack_view(view: PlacedImage) -> bytes:
     """The bytes of a view.
 
     Raises
@@ -105,7 +105,7 @@ def pack_view(view: View) -> bytes:
     return data
 
 
-def unpack_view(data: bytes) -> View:
+def unpack_view(data: bytes) -> PlacedImage:
     """Inverse of :func:`pack_view`.
 
     Raises
@@ -134,7 +134,7 @@ def unpack_view(data: bytes) -> View:
     reader.require_end()
     fx, fy, cx, cy = intrinsics.tolist()
     T = _pose(pose)
-    return View(session, index, stamp, start, T, (width, height), (fx, fy, cx, cy), jpeg, depth, steps)
+    return PlacedImage(session, index, stamp, start, T, (width, height), (fx, fy, cx, cy), jpeg, depth, steps)
 
 
 def rgb_of(jpeg: bytes) -> ByteArray:

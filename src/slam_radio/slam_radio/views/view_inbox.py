@@ -12,7 +12,7 @@ from pathlib import Path
 
 from slam_core.storage.files import atomic_path, atomic_text, read_bytes, read_json
 from slam_radio.views.view_files import ViewFiles
-from slam_radio.views.view_format import View, unpack_view
+from slam_radio.views.view_format import PlacedImage, unpack_view
 from slam_radio.wire.view_messages import MOST_VIEWS, PIECE_BYTES, Lack, Piece, ViewKey, unpack_piece
 
 _SAME_NS = 100_000_000
@@ -57,7 +57,7 @@ class ViewInbox:
         else:
             others[piece.number] = piece
 
-    def _finish(self) -> list[View]:
+    def _finish(self) -> list[PlacedImage]:
         """Keep views of which the last piece came just before the end of the last run."""
         views = []
         for pieces in list(self._pieces.values()):
@@ -68,7 +68,7 @@ class ViewInbox:
                 views.append(self._whole(piece))
         return views
 
-    def ask(self, key: ViewKey) -> View | None:
+    def ask(self, key: ViewKey) -> PlacedImage | None:
         """Want the view that is nearest to a stamp; returns it if it is here.
 
         Raises
@@ -117,7 +117,7 @@ class ViewInbox:
             self._drop(key)
         return len(gone)
 
-    def take(self, data: bytes) -> View | None:
+    def take(self, data: bytes) -> PlacedImage | None:
         """Keep the piece of a message; returns the view if that is whole now, or is the one of another moment here.
 
         Raises
@@ -149,7 +149,7 @@ class ViewInbox:
             pieces[piece.number] = piece
         return self._whole(piece) if len(pieces) == piece.count else None
 
-    def _whole(self, piece: Piece) -> View:
+    def _whole(self, piece: Piece) -> PlacedImage:
         """The view of all its pieces, which is kept.
 
         Raises
@@ -183,7 +183,7 @@ class ViewInbox:
         for key in [k for k in self.wanted if self._shown(k) == shown]:
             self._drop(key)
 
-    def _here(self, key: ViewKey) -> View | None:
+    def _here(self, key: ViewKey) -> PlacedImage | None:
         """A view that is here whole; None if it is not, or damaged."""
         if key not in self.files.sizes:
             return None

@@ -19,7 +19,7 @@ from slam_core.types import ByteArray, DepthImage, Submap
 from slam_radio.views.depth_code import depth_levels
 from slam_radio.views.view_config import ViewConfig
 from slam_radio.views.view_files import ViewFiles
-from slam_radio.views.view_format import MOST_BYTES, MOST_PIXELS, View, pack_view
+from slam_radio.views.view_format import MOST_BYTES, MOST_PIXELS, PlacedImage, pack_view
 from slam_radio.wire.view_messages import ViewKey
 
 _MOST_WAITING = 60
@@ -45,7 +45,7 @@ class ViewTaker:
         self.unkept: list[str] = []
         self._T_odom_base: FloatArray | None = None
         self._last: dict[int, FloatArray] = {}
-        self._waiting: deque[View] = deque()
+        self._waiting: deque[PlacedImage] = deque()
         """Of the camera in the rig, without a submap yet."""
 
     def set_pose(self, T_odom_base: FloatArray) -> None:
@@ -71,7 +71,7 @@ class ViewTaker:
         known = camera is not None and (camera.width, camera.height) == picture.shape[1::-1]
         intrinsics = _scaled(camera, share) if camera is not None and known else (0.0, 0.0, 0.0, 0.0)
         jpeg = encoded(small, self.config.quality, _PICTURE_BYTES)
-        self._wait(View(0, 0, stamp_ns, 0, T_base_camera, (width, height), intrinsics, jpeg))
+        self._wait(PlacedImage(0, 0, stamp_ns, 0, T_base_camera, (width, height), intrinsics, jpeg))
 
     def add_depth(self, image: DepthImage, T_base_camera: FloatArray, picture: ByteArray | None) -> None:
         """Take a depth image, and a picture (h, w, 3) uint8 in the same pixels, if there is one."""
@@ -87,9 +87,9 @@ class ViewTaker:
             small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
             jpeg = encoded(np.asarray(small, dtype=np.uint8), self.config.quality, _COLOURS_BYTES)
         size = width, height
-        self._wait(View(0, 0, image.stamp_ns, 0, T_base_camera, size, intrinsics, jpeg, depth, steps))
+        self._wait(PlacedImage(0, 0, image.stamp_ns, 0, T_base_camera, size, intrinsics, jpeg, depth, steps))
 
-    def _wait(self, view: View) -> None:
+    def _wait(self, view: PlacedImage) -> None:
         if self._T_odom_base is not None:
             self._last[view.kind] = self._T_odom_base
         if self._waiting and view.stamp_ns < self._waiting[-1].stamp_ns - _STEP_BACK_NS:
@@ -119,7 +119,7 @@ class ViewTaker:
                 self.unkept.append(str(error))
         return len(inside) - len(self.unkept)
 
-    def _keep(self, view: View, submap: Submap, T_start_camera: FloatArray) -> None:
+    def _keep(self, view: PlacedImage, submap: Submap, T_start_camera: FloatArray) -> None:
         placed = replace(
             view, session=submap.session, index=submap.index, start_stamp_ns=submap.start_stamp_ns,
             T_start_camera=T_start_camera,
