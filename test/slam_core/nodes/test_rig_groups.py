@@ -58,6 +58,23 @@ def test_a_camera_without_the_common_trigger_is_left_out_until_the_others_are_go
     assert rig.diagnostic.startswith("no camera a since 0.200 s")
 
 
+@pytest.mark.parametrize("ahead", [500, 2000, 2033, -400, -2000])
+def test_a_camera_with_another_clock_throws_no_other_out(ahead: int) -> None:
+    rig, used, dead = RigGroups[Item](["a", "b", "c"], patience=4), 0, 0
+    for stamp in range(0, 6000, 100):
+        rig.add("a", Item(stamp * MS))
+        rig.add("b", Item((stamp + ahead) * MS)) if stamp + ahead >= 0 else None
+        rig.add("c", Item((stamp + 1) * MS)) if stamp < 3000 else None
+        for group in groups_of(rig):
+            used += group[0][0] == 0
+            dead += (2, group[0][1] + 1) in group
+        assert sum(map(len, rig._queues.values())) < 25
+    rig.give_up()
+    used += sum(group[0][0] == 0 for group in rig.ready())
+    assert used == 60
+    assert dead == 30
+
+
 def test_a_camera_that_dies_holds_up_a_few_frames_and_comes_back() -> None:
     rig = RigGroups[Item](["a", "b"], patience=3)
     rig.add("a", Item(0))

@@ -54,6 +54,10 @@ class AwaitedStreams:
         """A frame has come; it may have to wait."""
         self._frames.append(stamp_ns)
 
+    def forget_frames(self) -> None:
+        """Forget the frames that have come, so that none counts against a stream any more."""
+        self._frames.clear()
+
     def must_wait(self, stamp_ns: int) -> bool:
         """True if a stream that is not silent has yet to reach the stamp."""
         return bool(self._missing(stamp_ns) - set(self.silent))

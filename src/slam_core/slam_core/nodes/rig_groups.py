@@ -11,7 +11,7 @@ camera that is heard has no common trigger with it: it is left out, and that is 
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from typing import Generic, Protocol, TypeVar
 
@@ -20,7 +20,7 @@ from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S
 from slam_core.rig_features import MOST_CAMERAS
 
 _ALONE = 2
-"""Groups in a row of cameras without the common trigger alone, after which these are used."""
+"""Frames of a camera without the common trigger, beyond ``patience`` and unheard the others, after which it is used."""
 
 
 class Stamped(Protocol):
@@ -55,6 +55,7 @@ class RigGroups(Generic[T]):
         if len(set(cameras)) < len(cameras) or len(cameras) > MOST_CAMERAS:
             raise ValueError(f"cameras must be at most {MOST_CAMERAS} different names, got {', '.join(cameras)}")
         self._cameras = tuple(cameras)
+        self._patience = patience
         self._tolerance_ns = round(PAIRING_TOLERANCE_S * 1e9)
         self._awaited = AwaitedStreams([_stream(camera) for camera in cameras], patience)
         self.clear()
@@ -63,9 +64,9 @@ class RigGroups(Generic[T]):
         """Forget what waits, and wait for all cameras anew."""
         self._awaited.clear()
         self._queues: dict[str, deque[T]] = {camera: deque() for camera in self._cameras}
-        self._in_step: set[int] = set()
-        self._in_a_row = 0
-        self._out_of_step: dict[int, int] = {}
+        self._in_step: set[str] = set()
+        self._unheard: Counter[str] = Counter()
+        self._out_of_step: Counter[str] = Counter()
         self._newest_frame_ns = -self._tolerance_ns
         self._done_ns = -1
 
@@ -84,59 +85,84 @@ class RigGroups(Generic[T]):
             return False
         queue.append(item)
         self._awaited.heard(_stream(camera), stamp)
-        if stamp > self._newest_frame_ns + self._tolerance_ns:
-            self._newest_frame_ns = stamp
-            self._awaited.frame(stamp)
+        if not self._in_step or camera in self._in_step:
+            self._unheard = Counter({camera: self._unheard[camera] + 1})
+            self._count_frame(stamp)
+        else:
+            self._wait_out_of_step(camera)
         return True
 
     def ready(self) -> Iterator[list[tuple[int, T]]]:
         """The groups that need wait for no camera, oldest first: numbers of cameras, and what they gave."""
-        while True:
-            stamps = [queue[0].stamp_ns for queue in self._queues.values() if queue]
-            if not stamps or self._awaited.must_wait(min(stamps)):
-                return
-            last = min(stamps) + self._tolerance_ns
-            parts = [
-                (k, queue.popleft())
-                for k, queue in enumerate(self._queues.values())
-                if queue and queue[0].stamp_ns <= last
-            ]
+        while (oldest := self.oldest_waiting_ns) is not None and not self._awaited.must_wait(oldest):
+            for camera in self._cameras:
+                if self._in_step and camera not in self._in_step:
+                    self._drop(camera, before_ns=oldest - self._tolerance_ns)
+            heads = {camera: queue[0].stamp_ns for camera, queue in self._queues.items() if queue}
+            last = min(heads.values()) + self._tolerance_ns
+            together = [camera for camera, stamp in heads.items() if stamp <= last]
+            parts = [(self._cameras.index(camera), self._queues[camera].popleft()) for camera in together]
             self._done_ns = max(item.stamp_ns for _, item in parts)
-            if used := self._in_step_with_first(parts):
-                yield used
+            self._use(together)
+            yield parts
 
-    def _in_step_with_first(self, parts: list[tuple[int, T]]) -> list[tuple[int, T]]:
-        """Parts of a group whose cameras have shared a stamp with the first camera that is heard."""
-        numbers = {number for number, _ in parts}
-        if not self._in_step or numbers & self._in_step:
-            self._in_step |= numbers
-        self._in_a_row = 0 if numbers & self._in_step else self._in_a_row + 1
-        if self._in_a_row > _ALONE:  # all others are gone, not only over
-            self._in_step |= numbers
-        for number in numbers - self._in_step:
-            self._out_of_step[number] = self._out_of_step.get(number, 0) + 1
-        return [(number, item) for number, item in parts if number in self._in_step]
+    def _count_frame(self, stamp_ns: int) -> None:
+        """Note a frame of the cameras that are in step, unless one of them has had it."""
+        if stamp_ns > self._newest_frame_ns + self._tolerance_ns:
+            self._newest_frame_ns = stamp_ns
+            self._awaited.frame(stamp_ns)
+
+    def _use(self, cameras: Sequence[str]) -> None:
+        """Count cameras as in step from now on; frames of others make nobody wait or too late."""
+        if self._in_step.issuperset(cameras):
+            return
+        self._in_step.update(cameras)
+        self._awaited.forget_frames()
+        self._newest_frame_ns = self._done_ns
+        for stamp in sorted(item.stamp_ns for camera in self._in_step for item in self._queues[camera]):
+            self._count_frame(stamp)
+
+    def _wait_out_of_step(self, camera: str) -> None:
+        """Keep a few frames of a camera that may yet have the trigger; all others gone, not only over, it is used."""
+        self._unheard[camera] += 1
+        queue = self._queues[camera]
+        if len(queue) >= max(self._patience, 2):  # fewer than make others count as silent
+            self._drop(camera, before_ns=queue[1].stamp_ns)
+        if self._unheard[camera] > self._patience + _ALONE:
+            self._use([camera])
+            self._awaited.give_up(queue[-1].stamp_ns)
+
+    def _drop(self, camera: str, before_ns: int) -> None:
+        """Leave out what a camera without the common trigger gave before a moment."""
+        queue = self._queues[camera]
+        while queue and queue[0].stamp_ns < before_ns:
+            queue.popleft()
+            self._out_of_step[camera] += 1
 
     @property
     def left_out(self) -> int:
         """Number of frames left out of cameras without a common trigger."""
-        return sum(self._out_of_step.values())
+        return self._out_of_step.total()
 
     def give_up(self) -> None:
         """Stop waiting for the cameras that are behind, until they are heard again."""
-        stamps = [queue[-1].stamp_ns for queue in self._queues.values() if queue]
+        stamps = [queue[-1].stamp_ns for queue in self._counted() if queue]
         if stamps:
             self._awaited.give_up(max(stamps))
 
     @property
     def oldest_waiting_ns(self) -> int | None:
         """Stamp of the oldest that waits for another camera."""
-        return min((queue[0].stamp_ns for queue in self._queues.values() if queue), default=None)
+        return min((queue[0].stamp_ns for queue in self._counted() if queue), default=None)
+
+    def _counted(self) -> list[deque[T]]:
+        """Queues of the cameras in step, of all before the first group."""
+        return [queue for camera, queue in self._queues.items() if not self._in_step or camera in self._in_step]
 
     @property
     def diagnostic(self) -> str:
         """Names of the cameras that have fallen silent or have no common trigger with the first, or ""."""
-        apart = [camera for k, camera in enumerate(self._cameras) if k in self._out_of_step and k not in self._in_step]
+        apart = [camera for camera in self._cameras if self._out_of_step[camera] and camera not in self._in_step]
         told = [f"camera {camera} has no common trigger with the others, it is not used" for camera in apart]
         return "; ".join([*filter(None, [self._awaited.diagnostic()]), *told])
 
