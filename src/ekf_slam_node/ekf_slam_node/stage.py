@@ -263,6 +263,11 @@ class FilterStage:
         self._forget_queues()
         return () if self._slam is None else self._slam.start_session()
 
+    def restart_camera(self, camera: str) -> None:
+        """Forget what waits of a camera whose clock has jumped back, after that of the rig; ValueError for no such."""
+        if self._rig is not None:
+            self._rig.restart(camera)
+
     def _forget_queues(self) -> None:
         self._waiting.clear()
         self._motions.clear()

@@ -141,6 +141,11 @@ class ScanOdometryStage:
         """The input has ended: nothing waits any more."""
         self.give_up()
 
+    def restart_camera(self, camera: str) -> None:
+        """Forget what waits of a camera whose clock has jumped back, after that of the rig; ValueError for no such."""
+        if self._rig is not None:
+            self._rig.restart(camera)
+
     def reset(self) -> None:
         """Forget everything: the next scan is the origin."""
         self._odometry.reset()

@@ -20,6 +20,7 @@ from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from sjsam_node.tags.map_tags import map_tags
 from slam_bags.reading.readings import AgentSensors, SessionStart
 from slam_bringup.pipeline.configuration import SystemConfig, filter_config
+from slam_bringup.pipeline.rig_sessions import RigSessions
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, Value
 from slam_bringup.pipeline.stage_times import StageTimes
@@ -60,7 +61,7 @@ class Mapper:
             for rig, s in rigs.items()
         }
         self._cameras = {own.agent: (rig, own.camera) for rig, s in rigs.items() for own in s}
-        self._first_cameras = {s[0].agent for s in rigs.values()}
+        self._sessions = {rig: RigSessions(own.camera for own in s) for rig, s in rigs.items()}
         self._diaries = {rig: _Diary() for rig in rigs}
         self._futures: list[Future[Outcome | None]] = []
         self._outcomes: list[Outcome] = []
@@ -72,8 +73,9 @@ class Mapper:
         agent, camera = self._cameras[item.agent]
         stage, value = self._filters[agent], item.value
         if isinstance(value, SessionStart):
-            if item.agent not in self._first_cameras:
-                return  # the other cameras of a rig share its clock
+            if not self._sessions[agent].begins(camera):
+                stage.restart_camera(camera)
+                return
             self._process_waiting(agent)
             self._diaries[agent].rides += stage.ride_spans
             self._hand_over(stage.start_session())

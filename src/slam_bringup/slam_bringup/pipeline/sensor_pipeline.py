@@ -31,6 +31,7 @@ from slam_bags.reading.readings import (
     StereoReading,
 )
 from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.rig_sessions import RigSessions
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.types import Features, ImuSample, OdometryReading, PositionReading, PressureReading
 from stereo_frontend.frame_log import FrameLog
@@ -95,6 +96,9 @@ class SensorPipeline:
         self._mask_role = MASK_ROLES["stereo" if self._uses_stereo else "tof"]
         self._features = FeatureStage(with_masks(config.feature_extractor, sensors), sensors.frames)
         self._odometry = scans or rig_scans(config, [sensors]) if odometry else None
+        self._scans_of_rig = scans or self._odometry
+        self._rig: tuple[SensorPipeline, ...] = (self,)
+        self._sessions = RigSessions([self._camera])
 
     def add(self, reading: Reading) -> Iterator[AgentItem]:
         """Take a reading; yields what it leads to. A stereo pair that waits for its ToF image comes out later."""
@@ -141,13 +145,20 @@ class SensorPipeline:
         return self._features.report()
 
     def _on_session(self, start: SessionStart) -> Iterator[AgentItem]:
-        """Begin a new session, after what waits of the one before; calibration and knowledge of the camera stay."""
-        yield from self.finish()
+        """Begin a new session, after what waits of the one before; calibration and knowledge of the camera stay.
+
+        The first camera of a rig that tells begins it for all; what others still have of the one before is left out.
+        """
+        if self._sessions.begins(self._camera):
+            for pipeline in self._rig:
+                yield from pipeline.finish()
+            if self._scans_of_rig is not None:
+                self._scans_of_rig.reset()
+        elif self._odometry is not None:
+            self._odometry.restart_camera(self._camera)
         self._stereo.reset()
         self._depth.reset()
         self._features.clear()
-        if self._odometry is not None:
-            self._odometry.reset()
         yield self._item(start)
 
     def _on_imu(self, sample: ImuSample) -> Iterator[AgentItem]:
@@ -210,12 +221,16 @@ def rig_pipelines(
     if odometry and not any(camera.scanner for camera in cameras):
         raise ValueError("scan odometry needs ToF images, and no camera of the rig has any: leave --odometry out")
     scans = rig_scans(config, cameras) if odometry else None
-    return {
+    pipelines = {
         camera.agent: SensorPipeline(
             for_camera(config, camera), camera, odometry and bool(camera.scanner), times, scans
         )
         for camera in cameras
     }
+    sessions = RigSessions(camera.camera for camera in cameras)
+    for pipeline in pipelines.values():
+        pipeline._rig, pipeline._sessions = tuple(pipelines.values()), sessions
+    return pipelines
 
 
 def for_camera(config: SystemConfig, camera: AgentSensors) -> SystemConfig:

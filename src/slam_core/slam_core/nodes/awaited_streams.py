@@ -54,6 +54,11 @@ class AwaitedStreams:
         """A frame has come; it may have to wait."""
         self._frames.append(stamp_ns)
 
+    def forget(self, stream: str) -> None:
+        """Forget what was heard of an expected stream: it is waited for anew."""
+        self._newest[stream] = None
+        self._given_up.discard(stream)
+
     def forget_frames(self) -> None:
         """Forget the frames that have come, so that none counts against a stream any more."""
         self._frames.clear()

@@ -70,6 +70,12 @@ class RigGroups(Generic[T]):
         self._newest_frame_ns = -self._tolerance_ns
         self._done_ns = -1
 
+    def restart(self, camera: str) -> None:
+        """Forget what waits of one camera, whose clock has jumped back; ValueError if the rig has no such camera."""
+        self._require(camera)
+        self._queues[camera].clear()
+        self._awaited.forget(_stream(camera))
+
     def add(self, camera: str, item: T) -> bool:
         """Take what one camera gives; False if they come too late, after the frame that they belong to.
 
@@ -78,8 +84,7 @@ class RigGroups(Generic[T]):
         ValueError
             If the rig has no such camera.
         """
-        if camera not in self._queues:
-            raise ValueError(f"the rig has no camera '{camera}', only {', '.join(self._cameras)}")
+        self._require(camera)
         queue, stamp = self._queues[camera], item.stamp_ns
         if stamp <= self._done_ns or (queue and stamp <= queue[-1].stamp_ns):
             return False
@@ -91,6 +96,10 @@ class RigGroups(Generic[T]):
         else:
             self._wait_out_of_step(camera)
         return True
+
+    def _require(self, camera: str) -> None:
+        if camera not in self._queues:
+            raise ValueError(f"the rig has no camera '{camera}', only {', '.join(self._cameras)}")
 
     def ready(self) -> Iterator[list[tuple[int, T]]]:
         """The groups that need wait for no camera, oldest first: numbers of cameras, and what they gave."""
