@@ -52,6 +52,11 @@ def test_a_tag_that_two_cameras_see_counts_for_the_first() -> None:
     assert (both.seen_by[np.isin(both.track_ids, corner_ids([5]))] == 0).all()
 
 
+def test_two_cameras_with_one_frame_are_refused() -> None:
+    with pytest.raises(ValueError, match="a frame of its own, got a, a"):
+        features_of_rig([(0, some_features(1, "a")), (1, some_features(2, "a"))])
+
+
 def test_a_blind_camera_takes_part_whatever_the_size_of_its_descriptors() -> None:
     nothing = some_features(1, "a").select(np.zeros(0, np.int64))
     nothing = replace(nothing, descriptors=np.zeros((0, 0), np.float32))

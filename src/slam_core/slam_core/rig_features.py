@@ -23,13 +23,17 @@ def features_of_rig(parts: Sequence[tuple[int, Features]]) -> Features:
     Raises
     ------
     ValueError
-        If there is no part, a number is not below :data:`MOST_CAMERAS`, or the descriptors differ in size.
+        If there is no part, a number is not below :data:`MOST_CAMERAS`, the descriptors differ in size, or two
+        cameras have one frame.
     """
     if not parts:
         raise ValueError("a frame of a rig needs the features of at least one camera")
     sizes = {features.descriptors.shape[1] for _, features in parts if len(features)}
     if len(sizes) > 1:
         raise ValueError(f"descriptors of the cameras of a rig must be of one kind, got sizes {sorted(sizes)}")
+    frames = [features.frame_id for _, features in parts]
+    if len(set(frames)) < len(frames):
+        raise ValueError(f"each camera of a rig needs a frame of its own, got {', '.join(frames)}")
     tags: set[int] = set()
     kept = []
     for k, (number, features) in enumerate(parts):

@@ -23,6 +23,9 @@ def tree_of(*edges: tuple[str, str]) -> FrameTree:
 def test_cameras_in_one_tree_are_one_rig() -> None:
     tree = tree_of(("base_link", "f"), ("base_link", "mount"), ("mount", "b"))
     assert rigs_of({"front": ["f"], "back": ["b"]}, tree) == {"": ("back", "front")}
+    depth_in_left = {"front": ["f", "f"], "back": ["b"]}
+    assert rigs_of(depth_in_left, tree) == {"": ("back", "front")}
+    assert rigs_of(depth_in_left, tree, ["/imu", "/odometry", "/front/imu"]) == {"": ("back", "front")}
 
 
 def test_the_cameras_of_an_agent_are_a_level_lower() -> None:
@@ -37,6 +40,7 @@ def test_the_cameras_of_an_agent_are_a_level_lower() -> None:
         ({"ann": ["f"], "ben": ["b"]}, [("base_link", "f"), ("ben/base_link", "b")]),  # a base of its own
         ({"ann": ["f"], "ben": ["b"]}, [("base_link", "f"), ("other", "b")]),  # not in one tree
         ({"ann": ["f"], "ben": ["b"]}, [("ann/base_link", "f"), ("ben/base_link", "b")]),
+        ({"ann": ["f"], "ben": []}, [("base_link", "f")]),  # no frame known
     ],
 )
 def test_agents_stay_agents(frames: dict[str, list[str]], edges: list[tuple[str, str]]) -> None:

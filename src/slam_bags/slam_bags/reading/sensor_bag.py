@@ -58,7 +58,8 @@ from slam_bags.reading.readings import (
     StereoReading,
 )
 from slam_bags.reading.rig_calibration import RigCalibration
-from slam_bags.reading.rig_cameras import RIG_ROLES, rigs_of
+from slam_bags.reading.rig_cameras import rigs_of
+from slam_bags.reading.rig_sensors import heard_cameras, on_rig
 from slam_bags.reading.sensor_topics import BagNames, find_agents, is_rectified, join, other_cameras, topics_of
 from slam_bags.storage.bag import BagReader
 from slam_core.camera import CameraInfo
@@ -278,8 +279,10 @@ class SensorBag:
         return Trajectory(np.array(stamps, dtype=np.int64), np.stack([poses[s] for s in stamps])) if stamps else None
 
     def _find_agents(self) -> tuple[str, ...]:
-        if cameras := tuple(self._names.rig.topics):
-            return cameras
+        if self._names.rig.topics:
+            heard, warnings = heard_cameras(self._names.rig, self._counts() if self.reader.is_indexed else {})
+            self._warnings += warnings
+            return heard
         found = find_agents(self.reader.topics, self._names.topics)
         if not found:
             topics = ", ".join(f"{name} ({info.type_name})" for name, info in self.reader.topics.items()) or "none"
@@ -295,9 +298,17 @@ class SensorBag:
             raise ValueError(f"a calibration is that of one rig, and {self.reader.path} has {len(self.agents)}")
         found = {agent: self._cameras_of(agent, tree) for agent in self.agents}
         frames = {agent: [f for f in (s.left_frame, s.tof_frame) if f] for agent, s in found.items()}
-        self.rigs = {"": self.agents} if self._names.rig.topics else rigs_of(frames, tree)
-        rig_of = {agent: rig for rig, agents in self.rigs.items() for agent in agents}
-        return {agent: self._on_rig(sensors, rig_of[agent]) for agent, sensors in found.items()}
+        self.rigs = {"": self.agents} if self._names.rig.topics else rigs_of(frames, tree, self.reader.topics)
+        for rig, cameras in self.rigs.items():
+            placed, warnings = on_rig(rig, {name: found[name] for name in cameras}, self._counts(), self._names)
+            self._warnings += warnings
+            for name, own in placed.items():
+                base = self._base_frame(rig, own.frames, own.left_frame or own.tof_frame)
+                found[name] = replace(own, base_frame=base)
+        return found
+
+    def _counts(self) -> dict[str, int]:
+        return {topic: info.count for topic, info in self.reader.topics.items()}
 
     def _cameras_of(self, agent: str, tree: FrameTree) -> AgentSensors:
         """The sensors in a namespace; which frame is that of their rig is not known yet."""
@@ -314,21 +325,6 @@ class SensorBag:
         for transform in self._names.calibration.transforms(left_frame, tof_frame):
             tree.add(transform.parent, transform.child, transform.T)
         return AgentSensors(agent, left, right, tof, measurement, tree, left_frame, tof_frame, topics=topics)
-
-    def _on_rig(self, sensors: AgentSensors, rig: str) -> AgentSensors:
-        """The sensors of a namespace as those of a rig; what is no camera is its first camera's."""
-        agent, cameras, topics = sensors.agent, self.rigs[rig], dict(sensors.topics)
-        camera = agent.rpartition("/")[2] if len(cameras) > 1 or self._names.rig.topics else ""
-        if camera:
-            topics = {role: topic for role, topic in topics.items() if role not in RIG_ROLES}
-            if agent == cameras[0]:
-                given = {r: t for r, t in self._names.topics.items() if r in RIG_ROLES}
-                own = topics_of(rig, self.reader.topics, given)
-                topics |= {role: topic for role, topic in own.items() if role in RIG_ROLES}
-                if "depth" in topics:
-                    topics.pop("scan", None)
-        base = self._base_frame(rig, sensors.frames, sensors.left_frame or sensors.tof_frame)
-        return replace(sensors, topics=topics, base_frame=base, rig=rig, camera=camera)
 
     def _base_frame(self, agent: str, tree: FrameTree, camera_frame: str) -> str:
         """Frame of the rig: base_link, or the root above the camera in a bag that has none."""

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from slam_bags.reading.rig_calibration import RigCalibration
-from slam_bags.reading.rig_cameras import RigCameras
+from slam_bags.reading.rig_cameras import RIG_ROLES, RigCameras
 
 _LEFT = ("stereo/left/image_raw", "stereo/left/image_rect", "stereo/left/image_raw/compressed")
 _CANDIDATES = {
@@ -109,6 +109,30 @@ def topics_of(agent: str, known: Collection[str], given: Mapping[str, str]) -> d
         if role not in given and beside:
             found[role] = next((topic for topic in beside if topic in known), beside[0])
     return found
+
+
+def topics_on_rig(
+    rig: str, cameras: Mapping[str, Mapping[str, str]], known: Collection[str], given: Mapping[str, str]
+) -> tuple[dict[str, dict[str, str]], list[str]]:
+    """Topics by role of each camera of a rig, the first with those of what is no camera, and the topics not used.
+
+    What is no camera has its topic at the rig, or is of the first camera that has one. ``cameras``: as in their
+    namespaces. Errors as of :func:`topics_of`.
+    """
+    own = topics_of(rig, known, {role: topic for role, topic in given.items() if role in RIG_ROLES})
+    of_rig = {role: topic for role, topic in own.items() if role in RIG_ROLES}
+    of_cameras: set[str] = set()
+    for topics in cameras.values():
+        beside = {role: topic for role, topic in topics.items() if role in RIG_ROLES}
+        of_rig, of_cameras = beside | of_rig, of_cameras | set(beside.values())
+    if any({"range", "depth"} & topics.keys() for topics in cameras.values()):
+        of_rig.pop("scan", None)
+    found = {
+        name: {role: topic for role, topic in topics.items() if role not in RIG_ROLES}
+        for name, topics in cameras.items()
+    }
+    found[next(iter(cameras))] |= of_rig
+    return found, sorted(of_cameras - set(of_rig.values()))
 
 
 def is_rectified(image_topic: str) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from slam_bags.reading.rig_cameras import shared_frame
 from slam_bringup.doctor.evidence import Evidence
 from slam_bringup.doctor.finding import Finding
 from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S
@@ -36,7 +37,13 @@ def cameras_text(rigs: Mapping[str, Sequence[Evidence]]) -> str:
 
 
 def check_rig(cameras: Sequence[Evidence]) -> Iterator[Finding]:
-    """Cameras without a common trigger, and such as have no images for a part of the recording."""
+    """Cameras with one frame or no common trigger, and such as have no images for a part of the recording."""
+    frames = {
+        own.camera: {c.frame for role, c in own.calibrations.items() if role != "right"} - {""} for own in cameras
+    }
+    if same := shared_frame(frames):
+        what, _, advice = same.partition(": ")
+        yield Finding("one frame", what, advice, prevents_mapping=True)
     stamps = {own.camera: np.sort(own.leader.stamps) for own in cameras if len(own.leader.stamps)}
     if not stamps:
         return

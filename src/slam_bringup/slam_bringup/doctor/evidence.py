@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from slam_bags.nodes.pacing import header_stamp_ns
 from slam_bags.reading.rig_cameras import rigs_of
-from slam_bags.reading.sensor_topics import BagNames, find_agents, is_rectified, topics_of
+from slam_bags.reading.sensor_topics import BagNames, find_agents, is_rectified, topics_of, topics_on_rig
 from slam_bags.storage.bag import BagReader, TopicInfo
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
@@ -147,36 +147,38 @@ def gather(path: Path, names: BagNames | None = None, *, messages: int | None = 
     with BagReader(path) as bag:
         agents = tuple(names.rig.topics) or find_agents(bag.topics, names.topics)
         if not agents:
-            topics = ", ".join(f"{n} ({i.type_name})" for n, i in bag.topics.items()) or "none"
+            present = ", ".join(f"{n} ({i.type_name})" for n, i in bag.topics.items()) or "none"
             raise ValueError(
                 f"{path} has no images under the names of the nodes: say which topics they are (--topic left=/... "
-                f"--topic right=/... or --topic depth=/...). Its topics: {topics}"
+                f"--topic right=/... or --topic depth=/...). Its topics: {present}"
             )
         frames = _read_frames(bag)
         for given in names.rig.transforms:
             frames.add(given.parent, given.child, given.T)
-        found = {agent: _gather_agent(bag, agent, frames, names, messages) for agent in agents}
-        image_frames = {
-            agent: [own.calibrations[role].frame for role in own.calibrations if role != "right"]
-            for agent, own in found.items()
+        roles = {agent: topics_of(agent, bag.topics, names.rig.topics.get(agent, names.topics)) for agent in agents}
+        calibrations = {
+            agent: {role: _calibration(bag, own[info]) for role, info in _INFOS.items() if role in own}
+            for agent, own in roles.items()
         }
-        rigs = {"": agents} if names.rig.topics else rigs_of(image_frames, frames)
+        image_frames = {
+            agent: [c.frame for role, c in own.items() if role != "right" and c.frame]
+            for agent, own in calibrations.items()
+        }
+        rigs = {"": agents} if names.rig.topics else rigs_of(image_frames, frames, bag.topics)
+        found = {}
         for rig, cameras in rigs.items():
-            for agent in cameras if len(cameras) > 1 else ():
-                found[agent].rig, found[agent].camera = rig, agent.rpartition("/")[2]
-        return list(found.values())
-
-
-def _gather_agent(bag: BagReader, agent: str, frames: FrameTree, names: BagNames, messages: int | None) -> Evidence:
-    known = bag.topics
-    topics = topics_of(agent, known, names.rig.topics.get(agent, names.topics))
-    streams = _streams(bag, {role: topics[role] for role in _STREAMED if role in topics}, messages)
-    calibrations = {role: _calibration(bag, topics[info]) for role, info in _INFOS.items() if role in topics}
-    usual = [f for f in (f"{agent}/base_link", "base_link") if f in frames]
-    base = names.base_frame or (usual[0] if usual else "")
-    evidence = Evidence(agent, topics, streams, calibrations, frames, base)
-    _decode_sample(bag, evidence, messages)
-    return evidence
+            if len(cameras) > 1 or names.rig.topics:
+                roles |= topics_on_rig(rig, {name: roles[name] for name in cameras}, bag.topics, names.topics)[0]
+            usual = [f for f in (f"{rig}/base_link", "base_link") if f in frames]
+            base = names.base_frame or (usual[0] if usual else "")
+            for agent in cameras:
+                topics = roles[agent]
+                streams = _streams(bag, {role: topics[role] for role in _STREAMED if role in topics}, messages)
+                own = Evidence(agent, topics, streams, calibrations[agent], frames, base)
+                own.rig, own.camera = (rig, agent.rpartition("/")[2]) if len(cameras) > 1 else ("", "")
+                _decode_sample(bag, own, messages)
+                found[agent] = own
+        return [found[agent] for agent in agents]
 
 
 def _streams(bag: BagReader, topics: Mapping[str, str], messages: int | None) -> dict[str, Stream]:
