@@ -52,6 +52,13 @@ class _Waiting:
     keyframe: Keyframe
 
 
+def cameras_of(agent: str, names: Sequence[str]) -> list[str]:
+    """Namespaces of an agent's cameras: of the ``names`` of every agent's, and of its own ``agent/camera``."""
+    own = [name for name in names if name.startswith(f"{agent}/")]
+    every = [f"{agent}/{name}".lstrip("/") for name in names if "/" not in name]
+    return [*every, *own] or [agent]
+
+
 class DenseStage:
     """Feeds a :class:`DenseModel` from several agents' cameras.
 

@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 
 from dense_mapping.colours import NO_PICTURE
 from dense_mapping.dense_model import DenseConfig
-from dense_mapping.dense_stage import DenseStage
+from dense_mapping.dense_stage import DenseStage, cameras_of
 from dense_mapping.plans.floor_plan import FloorPlan
 from dense_mapping.plans.plan_io import plan_names, write_plan
 from dense_mapping.plans.storeys import CurrentStorey
@@ -61,7 +61,9 @@ class DenseNodeConfig(DenseConfig):
 
     agents: tuple[str, ...] = parameter(("",), "namespaces of the agents whose cameras make the model")
     cameras: tuple[str, ...] = parameter(
-        (), "names of the cameras of each agent's rig that has several, each with its own topics; empty: one camera"
+        (),
+        "names of the cameras of each agent's rig that has several, each with its own topics, or of one agent's: "
+        "agent/camera; empty: one camera",
     )
     map_frame: str = parameter("map", "frame of the map")
     base_frame: str = parameter("base_link", "frame of each agent's rig, below its namespace")
@@ -78,7 +80,7 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         super().__init__("dense_mapper", DenseNodeConfig)
         self.mapper = DenseStage(self.config)
         # Each camera is to the model what an agent with one camera is, on the path of its rig.
-        self._cameras = {a: [below(a, c) for c in self.config.cameras] or [a] for a in self.config.agents}
+        self._cameras = {a: cameras_of(a, self.config.cameras) for a in self.config.agents}
         self._bases = {
             camera: below(agent, self.config.base_frame) for agent, own in self._cameras.items() for camera in own
         }

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from dense_mapping.dense_stage import cameras_of
 from ekf_slam_node.config import ExternalOdometryConfig
 from slam_bags.reading.readings import AgentSensors
 from slam_bringup.pipeline.configuration import choose, load_system_config
-from slam_bringup.processes.node_graph import live_nodes, plan_nodes
+from slam_bringup.processes.node_graph import live_nodes, plan_nodes, viewer_nodes
 from slam_bringup.processes.start_map import StartMap
 from slam_core.frame_tree import FrameTree
 
@@ -119,3 +120,45 @@ def test_the_frames_of_an_agent_are_those_of_its_bag_or_lie_below_its_name() -> 
 def test_the_stereo_mode_leaves_the_depth_camera_alone() -> None:
     graph = plan_nodes(choose(load_system_config(None), "stereo", "sjsam", "none"), {"": sensors()}, False, "map")
     assert not [topic for topic in graph.played.values() if "tof" in topic]
+
+
+def of_cameras(rig: str = "", **left: str) -> dict[str, AgentSensors]:
+    """Stereo cameras of a rig by namespace, with the name of the left images of each."""
+    found = {}
+    for name, image in left.items():
+        place = f"{rig}/{name}".lstrip("/")
+        topics = {side: f"/{place}/stereo/{side}/{image}" for side in ("left", "right")}
+        found[place] = AgentSensors(place, None, None, None, "depth", FrameTree(), topics=topics, rig=rig, camera=name)
+    return found
+
+
+def test_each_camera_has_a_driver_if_its_own_images_are_raw() -> None:
+    config = choose(load_system_config(None), "stereo", "sjsam", "none")
+    for images in (("image_rect", "image_raw"), ("image_raw", "image_rect")):
+        cameras = of_cameras(**dict(zip(("back", "front"), images, strict=True)))
+        specs = plan_nodes(config, cameras, False, "map").specs
+        drivers = [spec.namespace for spec in specs if spec.executable == "stereo_driver"]
+        assert drivers == [name for name, own in cameras.items() if own.topics["left"].endswith("raw")]
+
+
+def test_the_pressure_of_a_rig_is_heard_at_the_rig() -> None:
+    config = choose(load_system_config(None), "stereo", "sjsam", "none")
+    cameras = of_cameras(back="image_raw", front="image_raw")
+    cameras["back"].topics["pressure"] = "/front/pressure"
+    assert plan_nodes(config, cameras, False, "map").played["/front/pressure"] == "/pressure"
+
+
+def test_the_dense_model_hears_the_cameras_that_each_agent_has() -> None:
+    config = choose(load_system_config(None), "stereo", "sjsam", "none")
+    both = {"back": "image_raw", "front": "image_raw"}
+
+    def heard(cameras: dict[str, AgentSensors]) -> dict[str, list[str]]:
+        model = viewer_nodes(config, cameras, 8000)[0].parameters
+        return {agent: cameras_of(agent, model.get("cameras", ())) for agent in model.get("agents", ("",))}
+
+    assert heard(of_cameras(**both)) == {"": ["back", "front"]}
+    assert heard(of_cameras("a", **both) | of_cameras("c", **both)) == {
+        "a": ["a/back", "a/front"], "c": ["c/back", "c/front"]
+    }  # fmt: skip
+    assert heard(of_cameras("a", **both) | {"c": sensors("c")}) == {"a": ["a/back", "a/front"], "c": ["c"]}
+    assert heard({"": sensors()}) == {"": [""]}

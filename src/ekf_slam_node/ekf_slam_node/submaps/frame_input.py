@@ -47,7 +47,7 @@ def _keep_possible(uv, depth, sigma_uv, sigma_depth, usable):  # type: ignore[no
 
 
 def frame_of_strongest(features: Features, usable: np.ndarray, most: int) -> Frame:
-    """At ``most`` so many of the usable features of each camera as a frame: the strongest, in their own order."""
+    """Usable features as a frame: the strongest of all cameras, ``most`` for each, in their own order."""
     most *= max(1, len(features.cameras))
     index = np.flatnonzero(usable)
     if len(index) > most:

@@ -46,6 +46,6 @@ def read_rig_cameras(path: Path) -> RigCameras:
         raise ValueError(f"{path}: {error}") from error
     if wrong := [name for name in topics if not name.isidentifier()]:
         raise ValueError(f"{path}: '{wrong[0]}' is no name for a camera: letters, digits and _")
-    if not any(_CAMERA_ROLES & own.keys() for own in topics.values()):
-        raise ValueError(f"{path}: no camera has a topic of {', '.join(sorted(_CAMERA_ROLES))}")
+    if blind := [name for name, own in topics.items() if not _CAMERA_ROLES & own.keys()]:
+        raise ValueError(f"{path}: camera '{blind[0]}' has no topic of {', '.join(sorted(_CAMERA_ROLES))}")
     return RigCameras(topics, transforms)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ from slam_bringup.pipeline.configuration import choose, filter_config, load_syst
 from slam_bringup.pipeline.overrides import read_overrides
 from slam_bringup.pipeline.sensor_pipeline import SensorPipeline, depth_stage
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_bringup.terminal.mapping_options import mode_for
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile
 from slam_core.storage.files import atomic_text
@@ -84,7 +83,8 @@ def refine(bag: Path) -> Refined:
         If the bag has no camera infos, or shows nothing to correct.
     """
     with SensorBag(bag) as source:
-        agent, mode = source.agents[0], mode_for(source, None)
+        agent = source.agents[0]
+        mode = "stereo" if source.count(agent, "left") else "tof"
         sensors = source.sensors[agent]
         infos = {"left": sensors.left, "right": sensors.right} if mode == "stereo" else {"tof": sensors.tof}
         known = {name: info for name, info in infos.items() if info is not None}
@@ -106,7 +106,7 @@ def _learnt(source: SensorBag, agent: str, mode: str) -> tuple[FrontendReport, d
 
     One filter has the images alone, as the rolling shutter is seen best, another one the IMU as well.
     """
-    sensors = source.sensors[agent]
+    sensors = replace(source.sensors[agent], camera="")  # a camera of several is looked at for itself
     alone, aided = (choose(load_system_config(None), mode, "ekf", "none", imu) for imu in ("off", "auto"))
     pipeline = SensorPipeline(aided, sensors, False, StageTimes())
     stages = [

@@ -19,7 +19,7 @@ from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bags.reading.rig_cameras import RigCameras
 from slam_bags.reading.rig_file import read_rig_cameras
 from slam_bags.reading.sensor_bag import SensorBag
-from slam_bags.reading.sensor_topics import BagNames, nodes_name, parse_topics
+from slam_bags.reading.sensor_topics import BagNames, is_rectified, nodes_name, parse_topics
 from slam_bringup.pipeline.configuration import ODOMETRIES, choose, overrides_for, system_config, with_files
 from slam_bringup.pipeline.overrides import Overrides, overrides_of, parse_assignments, read_overrides
 from slam_bringup.processes.node_graph import NodeGraph, NodeSpec, live_nodes, plan_nodes
@@ -136,7 +136,8 @@ def _for_rig(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
         config,
         agents,
         odometry=values["odometry"] != "none",
-        rectified=values["rectified"] == "true",
+        rectified=values["rectified"] == "true"
+        or {name for name, own in names.rig.topics.items() if is_rectified(own.get("left", ""))},
         extra={
             "tof_driver": drivers["tof_driver"] | chosen,
             "feature_extractor": {"tof.images": images} if chooses else {},
@@ -173,7 +174,7 @@ def _remapped(topics: Mapping[str, str], place: str = "") -> list[tuple[str, str
 def _for_bag(values: Mapping[str, str], overrides: Overrides, names: BagNames) -> LaunchPlan:
     path = Path(values["bag"]).expanduser().resolve()
     with SensorBag(path, names) as bag:
-        has_stereo = bool(bag.count(bag.agents[0], "left"))
+        has_stereo = any(bag.count(agent, "left") for agent in next(iter(bag.rigs.values())))
         overrides = overrides_for(path, overrides)
         mode = ("stereo" if has_stereo else "tof") if values["mode"] == AUTO else values["mode"]
         config = choose(system_config(overrides), mode, "sjsam", values["odometry"])

@@ -71,7 +71,7 @@ def live_nodes(
     agents: Iterable[str],
     *,
     odometry: bool,
-    rectified: bool = False,
+    rectified: bool | Collection[str] = False,
     extra: Mapping[str, Mapping[str, Any]] | None = None,
     base_frames: Mapping[str, str] | None = None,
     known_roles: Mapping[str, Collection[str]] | None = None,
@@ -84,10 +84,11 @@ def live_nodes(
     ``cameras``: of agents whose rigs have several, the roles of each by its name; drivers and front end run once for
     each, in its namespace below the agent's, and ``extra`` is theirs by ``<agent>/<camera>/<executable>``.
 
-    ``rectified``: their stereo images are. ``extra``: parameters by executable. ``base_frames``: frame of each agent's
-    rig, by default ``base_link`` below the agent's name. ``known_roles``: sensors of each agent that are known to
-    report, such as its IMU; another is used as well, once it does. ``with_laser``: agents whose scan odometry registers
-    the scans of a laser. ``overrides``: what of them is not in ``config``.
+    ``rectified``: their stereo images are, or those in some namespaces. ``extra``: parameters by executable.
+    ``base_frames``: frame of each agent's rig, by default ``base_link`` below the agent's name. ``known_roles``:
+    sensors of each agent that are known to report, such as its IMU; another is used as well, once it does.
+    ``with_laser``: agents whose scan odometry registers the scans of a laser. ``overrides``: what of them is not in
+    ``config``.
     """
     base_frames, with_laser = base_frames or {}, set(with_laser)
     mode, extra, agents = config.feature_extractor.mode, extra or {}, tuple(agents)
@@ -99,7 +100,8 @@ def live_nodes(
         with_depth = tuple(name for name, roles in several.items() if "depth" in roles)
         for place, own_mode in modes.items():
             has_scans = agent not in with_laser if not several else place.rpartition("/")[2] in with_depth
-            if own_mode != "tof" and not rectified:
+            is_raw = not rectified if isinstance(rectified, bool) else place not in rectified
+            if own_mode != "tof" and is_raw:
                 specs.append(_spec("stereo_driver", None, place, extra))
             if own_mode != "stereo" or (odometry and has_scans):
                 specs.append(_spec("tof_driver", config.tof_driver, place, extra))
@@ -146,7 +148,8 @@ def plan_nodes(
         of_camera = _bag_parameters(for_camera(config, camera), camera, map_path, autosave, calibration)
         extra |= {f"{camera.agent}/{name}": of_camera[name] for name in _OF_A_CAMERA}
     specs = live_nodes(
-        config, rigs, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
+        config, rigs, odometry=odometry,
+        rectified={own.agent for own in sensors.values() if is_rectified(own.topics.get("left", ""))},
         extra=extra, base_frames=base_frames,
         overrides=overrides,
         known_roles={rig: own.topics for rig, own in firsts.items()},
@@ -177,7 +180,10 @@ def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port
     """The dense model and the page that shows it, beside the nodes of :func:`plan_nodes`."""
     rigs = _rigs(sensors)
     agents = tuple(rigs) if any(rigs) else ()
-    names = tuple(dict.fromkeys(own.camera for several in rigs.values() for own in several if own.camera))
+    of_rigs = {rig: tuple(own.camera for own in several if own.camera) for rig, several in rigs.items()}
+    names, *others = dict.fromkeys(of_rigs.values())
+    if others:
+        names = tuple(f"{rig}/{name}" for rig, own in of_rigs.items() for name in own)
     model = _spec("dense_mapper", config.dense_mapper, "", {}, agents=agents, cameras=names)
     page = _spec("viewer", None, "", {}, agents=agents, port=port)
     return [model, page]

@@ -166,7 +166,8 @@ def map_folder(old: Path | None, *, localize_only: bool) -> Path | None:
 
 def mode_for(bag: SensorBag, mode: str | None) -> str:
     """The mode asked for, or the one that the bag's sensors suggest."""
-    return mode or ("stereo" if bag.count(bag.agents[0], "left") else "tof")
+    first_rig = next(iter(bag.rigs.values()))
+    return mode or ("stereo" if any(bag.count(agent, "left") for agent in first_rig) else "tof")
 
 
 def require_map(result: RunResult) -> None:

@@ -87,13 +87,17 @@ class BagPictures(StampedPictures):
         self._points, self._sightings = landmarks.positions[landmarks.linked], landmarks.sightings[landmarks.linked]
         with SensorBag(bag) as opened:
             every = {a: max(1, len(t) // _MOST) for a, t in run.trajectories.items()}
+            firsts = {cameras[0]: rig for rig, cameras in opened.rigs.items()}
             count: dict[str, int] = defaultdict(int)
             for reading in opened.readings():
                 if not isinstance(reading, StereoReading | DepthReading) or not self._is_main(opened, reading):
                     continue
-                count[reading.agent] += 1
-                if count[reading.agent] % every.get(reading.agent, 1) == 0:
-                    self._keep(run, opened.sensors[reading.agent], reading)
+                if reading.agent not in firsts:
+                    continue  # of several cameras the first is shown
+                agent = firsts[reading.agent]
+                count[agent] += 1
+                if count[agent] % every.get(agent, 1) == 0:
+                    self._keep(run, agent, opened.sensors[reading.agent], reading)
 
     @staticmethod
     def _is_main(bag: SensorBag, reading: StereoReading | DepthReading) -> bool:
@@ -101,8 +105,8 @@ class BagPictures(StampedPictures):
         has_stereo = bag.sensors[reading.agent].is_mounted("left")
         return isinstance(reading, StereoReading) if has_stereo else True
 
-    def _keep(self, run: RunFolder, sensors: AgentSensors, reading: StereoReading | DepthReading) -> None:
-        trajectory = run.trajectories.get(reading.agent)
+    def _keep(self, run: RunFolder, agent: str, sensors: AgentSensors, reading: StereoReading | DepthReading) -> None:
+        trajectory = run.trajectories.get(agent)
         image, camera, mount = _image_of(sensors, reading)
         if trajectory is None or not len(trajectory) or image is None or camera is None:
             return
@@ -111,8 +115,8 @@ class BagPictures(StampedPictures):
             return
         T_map_camera = trajectory.interpolate(np.array([stamp]))[0] @ sensors.transform("base", mount)
         picture = draw_landmarks(image, camera, T_map_camera, self._points, self._sightings)
-        self._stamps[reading.agent].append(stamp)
-        self._jpegs[reading.agent].append(cv2.imencode(".jpg", picture, _JPEG)[1].tobytes())
+        self._stamps[agent].append(stamp)
+        self._jpegs[agent].append(cv2.imencode(".jpg", picture, _JPEG)[1].tobytes())
 
 
 def draw_landmarks(
