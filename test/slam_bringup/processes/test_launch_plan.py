@@ -53,6 +53,16 @@ def test_a_rig_may_name_its_topics_frames_and_files() -> None:
     assert "stereo_driver" not in {s.executable for s in plan_launch({"rectified": "true"}).nodes}
 
 
+def test_cameras_of_a_rig_whose_images_are_rectified_have_no_driver(tmp_path: Path) -> None:
+    lines = [
+        f"  {name}: {{left: /{name}/left/{image}, right: /{name}/right/{image}}}"
+        for name, image in (("a", "image_rect_raw"), ("b", "image_raw"))
+    ]
+    (tmp_path / "rig.yaml").write_text("\n".join(["cameras:", *lines]))
+    nodes = plan_launch({"rig": str(tmp_path / "rig.yaml")}).nodes
+    assert [spec.namespace for spec in nodes if spec.executable == "stereo_driver"] == ["b"]
+
+
 def test_the_odometry_of_a_rig_has_an_argument_of_its_own() -> None:
     plan = plan_launch({"odometry_topic": "/wheels", "topics": "imu=/imu/data"})
     assert dict(plan.remappings) == {"/odometry": "/wheels", "/imu": "/imu/data"}
