@@ -15,7 +15,7 @@ from ekf_slam_node.stage import IMU, MOTION, FilterConfig, FilterStage, FrameRes
 from feature_world import T_RIG_OPTICAL, loop, room
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import invert_transform
-from slam_core.types import Features, ImuSample, RelativeMotion
+from slam_core.types import Features, ImuSample, PressureReading, RelativeMotion
 
 STEP_NS = 100_000_000
 FRAMES = 16
@@ -103,8 +103,18 @@ def test_a_source_of_motions_that_never_lived_delays_only_the_first_frames(frame
     assert counts == [0, 0, 0, 4] + [1] * (FRAMES - 4)
 
 
+def test_frames_do_not_wait_for_a_barometer(frames_and_motions) -> None:
+    frames, _ = frames_and_motions
+    filter_stage, states = stage(frames[0].frame_id), []
+    filter_stage.add_pressure(PressureReading(frames[0].stamp_ns, 1e5))
+    for frame in frames:
+        filter_stage.add_features(frame)
+        states += [result.estimate.state for result in filter_stage.ready()]
+    assert states == [TrackingState.OK] * FRAMES
+
+
 def test_an_unknown_stream_is_refused() -> None:
-    with pytest.raises(ValueError, match="may hold motion, imu, odometry, pressure, got wheels"):
+    with pytest.raises(ValueError, match="may hold motion, imu, odometry, got wheels"):
         FilterConfig(wait_for=("wheels",))
 
 

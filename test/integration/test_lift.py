@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,8 @@ HEIGHT = 9.0
 @pytest.fixture(scope="module")
 def lift(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bag = tmp_path_factory.mktemp("lift") / "bag"
-    write_bag(Scenario.load("lift").with_profile("ideal"), bag, BagOptions(images="jpeg"))
+    scenario = Scenario.load("lift").with_profile("ideal")
+    write_bag(replace(scenario, sensors=(*scenario.sensors, "pressure")), bag, BagOptions(images="jpeg"))
     return bag
 
 

@@ -91,7 +91,9 @@ class RideConfig(Config):
     """Lift rides, and the barometer that measures their height beside the accelerometer."""
 
     use: str = parameter(
-        "auto", "whether rides are looked for: where there is an IMU, or never", choices=("auto", "off")
+        "auto",
+        "whether rides are looked for: by IMU and barometer where both agree, by the IMU alone, or never",
+        choices=("auto", "imu", "off"),
     )
     sigma_pressure_height: float = parameter(
         0.3, "noise of a barometer whose readings claim no variance, as a height", unit="m", minimum=1e-3

@@ -133,6 +133,7 @@ class EkfSlam:
         try:
             result = self._rides.after_frame(frame, self._advance(frame))
         except np.linalg.LinAlgError:
+            self._rides.after_failure()
             return self._recovery.abandon(frame, "a matrix could not be factored")
         if self._aids.external.slips > slips:
             self.counters.add("odometry_slips", self._aids.external.slips - slips)
@@ -294,13 +295,15 @@ class EkfSlam:
         None if there are not, and few features have made the link: the IMU bridges the frame.
         """
         told = self._aids.witness(self._chain.stamp_ns, stamp_ns)
-        if told is None or self._is_carried(told, link.T, stamp_ns):
+        if told is None:
             return link
         if not contradicts(told, link.T, link.covariance, RELATIVE_POSE_GATE):
             return replace(link, is_sure=True)
+        dt = seconds_between(self._chain.stamp_ns, stamp_ns)
         other = self._linker.link_at(candidates, frame, fused_prior(expected, told), link.variance_scale)
         if other is None or contradicts(told, other.T, other.covariance, RELATIVE_POSE_GATE):
-            if told.rows != ALL or len(link.rows) >= CONVINCING * min(len(candidates), len(frame)):
+            is_convincing = len(link.rows) >= CONVINCING * min(len(candidates), len(frame))
+            if told.rows != ALL or is_convincing or self._aids.suspects_ride(told, link.T, dt):
                 return link
             self._aids.add_inconsistency(stamp_ns)
             self.counters.add("links_refuted")
@@ -308,11 +311,6 @@ class EkfSlam:
         moving = np.setdiff1d(link.columns, other.columns)
         self._linker.mark_moving(frame, moving)
         return replace(other, moving=link.moving + len(moving))  # which the IMU is sure of
-
-    def _is_carried(self, told: RelativePoseMeasurement, T: FloatArray, stamp_ns: int) -> bool:
-        """True if a lift may explain why the IMU contradicts a rig that is seen to stand."""
-        dt = seconds_between(self._chain.stamp_ns, stamp_ns)
-        return told.rows == ALL and self._aids.rides.suspects(self._aids.inertial, told.T, T, dt)
 
     def _is_inconsistent(self, stamp_ns: int, link: FrameLink) -> bool:
         """True if looks alone have led to a place where the IMU says that the rig cannot be."""

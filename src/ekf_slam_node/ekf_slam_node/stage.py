@@ -2,7 +2,9 @@
 """EKF-SLAM of one rig without ROS: features, motions and IMU readings in any order in, results in order of stamps out.
 
     features ----------------> wait until all others have reached their stamp -> EkfSlam -> result, finished submaps
-    motions, IMU, odometry, pressure --^
+    motions, IMU, odometry --^
+
+Nothing waits for a barometer, whose readings are few and late: a frame uses those up to its stamp that have come.
 
 Of a rig with several cameras the features of one moment are joined first (:mod:`slam_core.nodes.rig_groups`).
 
@@ -26,7 +28,7 @@ from slam_core.nodes.rig_groups import RigGroups
 from slam_core.rig_features import features_of_rig
 from slam_core.types import Counters, Features, ImuSample, OdometryReading, PressureReading, RelativeMotion, Submap
 
-MOTION, IMU, ODOMETRY, PRESSURE = STREAMS = "motion", "imu", "odometry", "pressure"
+MOTION, IMU, ODOMETRY = STREAMS = "motion", "imu", "odometry"
 _SIGNIFICANT_OFFSET_S, _SIGNIFICANT_SIGMAS = 3e-3, 4.0
 """A difference of the clocks so large is told."""
 
@@ -93,7 +95,6 @@ class FilterStage:
         self._poses: deque[OdometryReading] = deque()
         self._last_pose_ns = -1
         self._pressures: deque[PressureReading] = deque()
-        self._last_pressure_ns = -1
         self._awaited = AwaitedStreams(config.wait_for, config.patience)
         self._rig = RigGroups[Features](config.cameras, config.patience) if config.cameras else None
         self._slam: EkfSlam | None = None
@@ -162,7 +163,6 @@ class FilterStage:
         if self._config.ride.use == "off":
             return
         self._pressures.append(reading)
-        self._awaited.heard(PRESSURE, reading.stamp_ns)
 
     def ready(self) -> Iterator[FrameResult]:
         """Results of the frames that need not wait, oldest first.
@@ -274,7 +274,7 @@ class FilterStage:
         self._samples.clear()
         self._poses.clear()
         self._pressures.clear()
-        self._last_sample_ns = self._last_pose_ns = self._last_pressure_ns = -1
+        self._last_sample_ns = self._last_pose_ns = -1
         self._awaited.clear()
         if self._rig is not None:
             self._rig.clear()
@@ -325,7 +325,5 @@ class FilterStage:
             pose = self._poses.popleft()
             self._last_pose_ns = pose.stamp_ns
             slam.process_odometry(pose)
-        while self._pressures and self._last_pressure_ns < stamp_ns:
-            reading = self._pressures.popleft()
-            self._last_pressure_ns = reading.stamp_ns
-            slam.process_pressure(reading)
+        while self._pressures and self._pressures[0].stamp_ns <= stamp_ns:
+            slam.process_pressure(self._pressures.popleft())

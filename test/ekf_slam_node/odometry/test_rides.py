@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ekf_slam_node.config import InertialConfig, MotionConfig, RideConfig
+from ekf_slam_node.odometry.cabin import Ride
 from ekf_slam_node.odometry.relative_poses import RelativePoseBuffer
-from ekf_slam_node.odometry.rides import Ride
 from slam_core.geometry import (
     FloatArray,
     boxplus,
@@ -75,7 +75,11 @@ def ideal(height: Callable[[float], float]) -> tuple[list[float], FloatArray]:
 
 
 def ridden(
-    height: Callable[[float], float], seed: int, seen_height: Callable[[float], float] = stays, pressure: bool = False
+    height: Callable[[float], float],
+    seed: int,
+    seen_height: Callable[[float], float] = stays,
+    pressure: Callable[[float], float] | None = None,
+    use: str = "imu",
 ) -> list[Ride]:
     """The rides that are found while the images show the motion within a storey, or ``seen_height`` of it."""
     rng = np.random.default_rng(seed)
@@ -83,14 +87,14 @@ def ridden(
     bias = np.concatenate([0.01 * rng.standard_normal(3), 0.05 * rng.standard_normal(3)])
     density = np.repeat([NOISE.gyroscope_noise_density, NOISE.accelerometer_noise_density], 3)
     rows = rows + bias + density * np.sqrt(RATE) * rng.standard_normal(rows.shape)
-    aids = RelativePoseBuffer(MotionConfig(), NOISE, None, RideConfig())
+    aids = RelativePoseBuffer(MotionConfig(), NOISE, None, RideConfig(use=use))
     for t, row in zip(times, rows, strict=True):
         aids.add_imu(ImuSample(round(t * 1e9), row[:3], row[3:]))
-    if pressure:
+    if pressure is not None:
         scale = 1.0 + 0.03 * rng.standard_normal()
         walk = np.cumsum(0.02 * np.sqrt(0.1) * rng.standard_normal(int(SECONDS * 10) + 1))
         for k, drift in enumerate(walk):
-            pascal = 1e5 * np.exp(-(scale * height(0.1 * k) + drift) / 8434.0) + 1.5 * rng.standard_normal()
+            pascal = 1e5 * np.exp(-(scale * pressure(0.1 * k) + drift) / 8434.0) + 1.5 * rng.standard_normal()
             assert not aids.rides.pressure.add(PressureReading(k * 10**8, pascal, 1.5**2))
     rides = []
     for k in range(int(SECONDS * 1e9) // STEP_NS - 1):
@@ -128,7 +132,7 @@ def test_heights_of_rides_are_honest() -> None:
 def test_a_barometer_makes_heights_surer() -> None:
     errors = []
     for seed in range(12):
-        (ride,), (alone,) = ridden(by_lift, seed, pressure=True), ridden(by_lift, seed)
+        (ride,), (alone,) = ridden(by_lift, seed, pressure=by_lift), ridden(by_lift, seed)
         errors.append((ride.height - 9.0) ** 2 / ride.variance)
         assert ride.variance < alone.variance
     assert 0.2 < np.mean(errors) < 2.2
@@ -141,6 +145,23 @@ def test_who_climbs_or_stands_does_not_ride(height: Callable[[float], float], se
 
 def test_who_is_carried_sideways_too_does_not_ride_a_lift() -> None:
     assert ridden(by_escalator, 3) == []
+
+
+def test_by_default_no_ride_is_found_without_a_barometer() -> None:
+    assert ridden(by_lift, 5, use="auto") == []
+    assert ridden(by_lift, 5, pressure=by_lift, use="off") == []
+
+
+@pytest.mark.parametrize("told", [stays, lambda t: -by_lift(t), lambda t: 2.5 * by_lift(t)])
+def test_a_barometer_that_tells_another_change_of_height_refutes_a_ride(told: Callable[[float], float]) -> None:
+    assert ridden(by_lift, 5, pressure=told, use="auto") == []
+
+
+def test_a_ride_that_a_barometer_confirms_is_found_from_its_start() -> None:
+    for seed in range(4):
+        (ride,) = ridden(by_lift, seed, pressure=by_lift, use="auto")
+        assert abs(ride.height - 9.0) < 3.0 * np.sqrt(ride.variance) < 0.7
+        assert ride.start_ns < (STANDS + JOURNEY.wait + 1.0) * 1e9
 
 
 def test_a_ride_down_is_one_too() -> None:

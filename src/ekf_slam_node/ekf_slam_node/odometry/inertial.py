@@ -20,6 +20,7 @@ left out, with a reason, and the gyroscope is used alone.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,6 +107,12 @@ class InertialFilter:
         self._first_force = self._first_s = 0.0
         self.forget_motion()
 
+    def fork(self) -> InertialFilter:
+        """A filter of its own with this one's state."""
+        other = copy.copy(self)
+        other._clock = copy.copy(self._clock)
+        return other
+
     def forget_motion(self) -> None:
         """Velocity and gravity are unknown from here on: readings were missing. The biases and the clock stay."""
         self.velocity, self.gravity = np.zeros(3), np.zeros(3)
@@ -124,6 +131,11 @@ class InertialFilter:
     def sigma_time_offset(self) -> float:
         """Standard deviation of the time offset, s."""
         return float(np.sqrt(self.covariance[12, 12]))
+
+    @property
+    def variance_scale(self) -> float:
+        """Running mean of the ways' normalised squared errors, 1 if all is as claimed."""
+        return self._variance_scale
 
     @property
     def sigma_velocity(self) -> FloatArray:

@@ -12,6 +12,7 @@ from math import isfinite
 import numpy as np
 
 from ekf_slam_node.config import RideConfig
+from slam_core.geometry import FloatArray
 from slam_core.types import PressureReading
 
 SCALE_HEIGHT = 8434.0
@@ -35,6 +36,7 @@ class PressureHeights:
         self._readings: deque[tuple[int, float, float]] = deque()
         self._first = 0.0
         self._reference = np.nan
+        self._used_ns = 0
 
     def add(self, reading: PressureReading) -> str:
         """Take a reading; returns why it is rejected, or ""."""
@@ -51,6 +53,11 @@ class PressureHeights:
             self._readings.popleft()
         return ""
 
+    @property
+    def is_heard(self) -> bool:
+        """True from the first usable reading on."""
+        return bool(self._readings)
+
     def start(self, stamp_ns: int) -> float:
         """Take the height before a stamp as that of a ride's start; returns its standard deviation, m."""
         before = [r for r in self._readings if stamp_ns - _MEAN_NS <= r[0] <= stamp_ns]
@@ -62,10 +69,24 @@ class PressureHeights:
         return float(np.sqrt(variance))
 
     def since(self, start_ns: int, stamp_ns: int) -> tuple[float, float] | None:
-        """Height (m) of a stamp above a ride's start, with the variance of one reading; None without a reading."""
+        """Height (m) of a stamp above a ride's start, with the variance of one reading; None without a new reading."""
         if np.isnan(self._reference) or stamp_ns <= start_ns or not self._readings:
             return None
         at, height, variance = min(self._readings, key=lambda reading: abs(reading[0] - stamp_ns))
-        if abs(at - stamp_ns) > _NEAR_NS:
+        if abs(at - stamp_ns) > _NEAR_NS or at <= self._used_ns:
             return None
+        self._used_ns = at
         return height - self._reference, variance
+
+    def recent(self, start_ns: int, stamp_ns: int) -> FloatArray:
+        """Readings (n, 3) since a ride's start in the second before a stamp.
+
+        Columns: stamp, ns, height above the start, m, and the variance of the mean of all these heights, m2.
+        """
+        first_ns = max(start_ns, stamp_ns - _MEAN_NS)
+        kept = np.array([r for r in self._readings if first_ns < r[0] <= stamp_ns]).reshape(-1, 3)
+        if np.isnan(self._reference) or not len(kept):
+            return np.zeros((0, 3))
+        kept[:, 1] -= self._reference
+        kept[:, 2] = kept[:, 2].mean() / min(len(kept), _INDEPENDENT)
+        return kept

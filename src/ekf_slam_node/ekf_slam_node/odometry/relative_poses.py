@@ -137,14 +137,13 @@ class RelativePoseBuffer:
         """
         if T_previous_now is None or covariance is None:
             self.external.forget_motion()
-        elif self.external.is_heard:
+        elif self.external.is_heard and not self.rides.is_riding:
             self.external.learn(start_stamp_ns, end_stamp_ns, T_previous_now, covariance)
         if self._readings.newest is None:
             return True
         pre = self._preintegral(start_stamp_ns, end_stamp_ns)
         if pre is None or start_stamp_ns != self._reached_ns:
-            self.inertial.forget_motion()
-            self.rides.forget()
+            self.rides.unread(self.inertial, end_stamp_ns if pre is None else start_stamp_ns)
         self._newest, self._reached_ns = (0, 0, None), end_stamp_ns
         if pre is None:
             return True
@@ -152,7 +151,6 @@ class RelativePoseBuffer:
         step = self.inertial.predict(pre)
         if T_previous_now is None or covariance is None:
             self.rides.unseen(self.inertial, step, end_stamp_ns)
-            self.inertial.advance(step)
             return True
         return self._measure_imu(step, (start_stamp_ns, end_stamp_ns), T_previous_now, covariance)
 
@@ -161,12 +159,8 @@ class RelativePoseBuffer:
     ) -> bool:
         """Let the IMU's filter measure a motion by images, in a lift as one within the cabin; False if they differ."""
         T, at_imu = at_place(T_previous_now, covariance, self._place())
-        self.inertial = self.rides.take(self.inertial, step, stamps, T, at_imu)
-        if not self.rides.is_riding:
-            return self.inertial.measure(step, T, at_imu)
-        self.rides.within_cabin(self.inertial, self.inertial.predict(step.pre), stamps[1], T, at_imu)
-        self.rides.end_if_at_rest(stamps[1])
-        return True
+        self.inertial, agrees = self.rides.measure(self.inertial, step, stamps, T, at_imu)
+        return agrees
 
     def witness(self, start_stamp_ns: int, end_stamp_ns: int) -> RelativePoseMeasurement | None:
         """The motion, or its rotation, as an IMU tells it that has agreed with the images so far; None without one."""
@@ -192,6 +186,10 @@ class RelativePoseBuffer:
             return False
         self.add_inconsistency(end_stamp_ns)
         return True
+
+    def suspects_ride(self, told: RelativePoseMeasurement, T_previous_now: FloatArray, dt: float) -> bool:
+        """True if a lift may explain why the IMU tells another motion over dt (s) of a rig that is seen to stand."""
+        return told.rows == ALL and self.rides.suspects(self.inertial, told.T, T_previous_now, dt)
 
     def add_inconsistency(self, stamp_ns: int) -> None:
         """A motion up to a stamp is not believed because of the IMU, which may be the one that is wrong."""

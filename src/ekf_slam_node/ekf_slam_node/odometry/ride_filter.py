@@ -14,7 +14,7 @@ heights of the way once the end is known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,10 @@ _SIGMA_START = 1e-3
 """Standard deviation (m) of the height at the start, where it is zero."""
 _SIGMA_REST = 0.03
 """By how much (m/s) a cabin that has arrived may still move."""
+_SPEED_NS = 400_000_000
+"""The cabin's speed is its mean over at least so long."""
+_UNREAD_ACCELERATION, _UNREAD_FORCE = 1.0, 0.1
+"""Acceleration of a cabin over missing readings, and error of the vertical force after them, m/s2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +58,10 @@ class HeightAt:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """One step: its transition, the state that was predicted and the state after all measurements."""
+    """One step: its transition, the state that was predicted and the state after all measurements.
+
+    gained: height (m) gained in it, the noise of whose part seen by images has the variance ``seen_variance``, m2.
+    """
 
     stamp_ns: int
     F: FloatArray
@@ -62,6 +69,8 @@ class _Step:
     predicted_covariance: FloatArray
     state: FloatArray
     covariance: FloatArray
+    gained: float
+    seen_variance: float
 
 
 class RideFilter:
@@ -92,8 +101,8 @@ class RideFilter:
         self._x = np.array([0.0, speed, 0.0, 0.0, 0.0])
         self._P = np.diag([_SIGMA_START**2, 0.0, 0.0, sigma_offset**2, sigma_scale**2])
         self._P[V : B + 1, V : B + 1] = covariance
-        self._drift, self._walked, self._seen_speed = drift, 0.0, speed
-        self._steps = [self._step(np.eye(5), self._x, self._P, stamp_ns)]
+        self._drift, self._walked = drift, 0.0
+        self._steps = [_Step(stamp_ns, np.eye(5), self._x, self._P, self._x, self._P, 0.0, 0.0)]
 
     @property
     def stamp_ns(self) -> int:
@@ -106,26 +115,59 @@ class RideFilter:
         return HeightAt(self.stamp_ns, float(self._x[H]), float(self._P[H, H]))
 
     @property
+    def velocity(self) -> float:
+        """Velocity of the rig upwards at the newest frame, m/s."""
+        return float(self._x[V])
+
+    @property
+    def risen(self) -> float:
+        """Height of the rig above its place at the start, motion within the cabin included, m."""
+        return float(self._x[H]) + self._walked
+
+    @property
     def speed(self) -> float:
-        """Speed of the cabin upwards at the newest frame, m/s."""
-        return float(self._x[V]) - self._seen_speed
+        """Mean speed of the cabin upwards over the newest frames, m/s."""
+        return self._mean_speed()[0]
 
     def advance(self, motion: VerticalMotion, stamp_ns: int) -> None:
         """Move on by a motion to a stamp."""
-        dt = motion.dt
+        noise = np.zeros((5, 5))
+        noise[:2, :2] = motion.covariance
+        noise[H, H] += motion.seen_variance
+        self._walked += motion.seen
+        self._move(motion.dt, motion.distance - motion.seen, motion.speed, noise, motion.seen_variance, stamp_ns)
+
+    def go_on(self, stamp_ns: int) -> None:
+        """Move on to a stamp without any reading: with the speed so far, which a cabin may change."""
+        dt = 1e-9 * (stamp_ns - self.stamp_ns)
+        way = np.array([0.5 * dt**2, dt, 0.0, 0.0, 0.0])
+        noise = _UNREAD_ACCELERATION**2 * np.outer(way, way)
+        noise[B, B] = _UNREAD_FORCE**2
+        self._move(dt, 0.0, 0.0, noise, float(noise[H, H]), stamp_ns)
+
+    def _move(
+        self, dt: float, way: float, speed: float, noise: FloatArray, seen_variance: float, stamp_ns: int
+    ) -> None:
         F = np.eye(5)
         F[H, V], F[H, B], F[V, B] = dt, 0.5 * dt**2, dt
         x = F @ self._x
-        x[H] += motion.distance - motion.seen
-        x[V] += motion.speed
-        P = F @ self._P @ F.T
-        P[:2, :2] += motion.covariance
-        P[H, H] += motion.seen_variance
+        x[H] += way
+        x[V] += speed
+        P = F @ self._P @ F.T + noise
         P[C, C] += self._drift**2 * dt
-        self._walked += motion.seen
-        self._seen_speed = motion.seen / dt
+        gained = float(x[H] - self._x[H])
         self._x, self._P = x, 0.5 * (P + P.T)
-        self._steps.append(self._step(F, x, self._P, stamp_ns))
+        self._steps.append(_Step(stamp_ns, F, x, self._P, x, self._P, gained, seen_variance))
+
+    def _mean_speed(self) -> tuple[float, float, float]:
+        """Mean speed (m/s) over the newest frames, the time (s) of these, and the variance by the images."""
+        gained = variance = 0.0
+        for step, before in zip(self._steps[:0:-1], self._steps[-2::-1], strict=True):
+            gained, variance = gained + step.gained, variance + step.seen_variance
+            if self.stamp_ns - before.stamp_ns >= _SPEED_NS:
+                break
+        dt = 1e-9 * (self.stamp_ns - before.stamp_ns) if len(self._steps) > 1 else 0.0
+        return (gained / dt, dt, variance / dt**2) if dt > 0.0 else (float(self._x[V]), 0.0, 0.0)
 
     def measure_pressure_height(self, height: float, variance: float) -> float:
         """Measure the rig's height above its start by a barometer; returns the squared normalised error."""
@@ -133,16 +175,15 @@ class RideFilter:
         predicted = (1.0 + self._x[S]) * (self._x[H] + self._walked) + self._x[C]
         return self._measure(height - predicted, J, variance)
 
-    def come_to_rest(self) -> float:
-        """Measure that the cabin stands; returns the squared normalised error.
+    def come_to_rest(self) -> tuple[float, float]:
+        """Measure that the cabin stands; returns the speed's error (m/s) and its squared normalised one.
 
-        An error larger than claimed means that the specific force was worse than claimed on the whole way.
+        An error larger than claimed means that the specific force was worse than claimed on the whole way. The mean
+        speed over a time T is V - b T / 2 less what the rig has moved within the cabin.
         """
-        J = np.array([0.0, 1.0, 0.0, 0.0, 0.0])
-        error, expected = self._seen_speed - float(self._x[V]), float(self._P[V, V]) + _SIGMA_REST**2
-        squared = error**2 / expected
-        self._measure(error, J, _SIGMA_REST**2)
-        return squared
+        speed, dt, variance = self._mean_speed()
+        J = np.array([0.0, 1.0, -0.5 * dt, 0.0, 0.0])
+        return speed, self._measure(-speed, J, _SIGMA_REST**2 + variance)
 
     def smoothed(self) -> list[HeightAt]:
         """Heights at all stamps after the start, by all measurements (Rauch, Tung and Striebel 1965)."""
@@ -163,9 +204,5 @@ class RideFilter:
         A = np.eye(5) - np.outer(gain, J)
         self._P = A @ self._P @ A.T + variance * np.outer(gain, gain)
         last = self._steps[-1]
-        self._steps[-1] = _Step(last.stamp_ns, last.F, last.predicted, last.predicted_covariance, self._x, self._P)
+        self._steps[-1] = replace(last, state=self._x, covariance=self._P)
         return error**2 / total
-
-    @staticmethod
-    def _step(F: FloatArray, x: FloatArray, P: FloatArray, stamp_ns: int) -> _Step:
-        return _Step(stamp_ns, F, x, P, x, P)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dense_mapping.dense_model import DenseConfig
-from ekf_slam_node.stage import IMU, MOTION, ODOMETRY, PRESSURE, FilterConfig
+from ekf_slam_node.stage import IMU, MOTION, ODOMETRY, FilterConfig
 from ndt_registration.odometry import OdometryConfig
 from sjsam_node.global_map import GlobalMapConfig
 from slam_bags.reading.readings import AgentSensors
@@ -146,11 +146,7 @@ def filter_config(config: FilterConfig, sensors: AgentSensors, *others: AgentSen
 
 def awaited_streams(config: FilterConfig, roles: Collection[str]) -> tuple[str, ...]:
     """The streams that frames wait for from the start, with those of the sensors in ``roles`` that are used."""
-    used = (
-        (IMU, "imu", config.imu.use),
-        (ODOMETRY, "odometry", config.odometry.use),
-        (PRESSURE, "pressure", config.ride.use),
-    )
+    used = (IMU, "imu", config.imu.use), (ODOMETRY, "odometry", config.odometry.use)
     return (*config.wait_for, *(stream for stream, role, use in used if role in roles and use != "off"))
 
 
