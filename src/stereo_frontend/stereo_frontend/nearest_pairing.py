@@ -9,19 +9,9 @@ silent no frame waits, see :class:`slam_core.nodes.awaited_streams.AwaitedStream
 from __future__ import annotations
 
 from collections import deque
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
-from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams
-
-
-class Stamped(Protocol):
-    """Anything with a header stamp."""
-
-    @property
-    def stamp_ns(self) -> int:
-        """The stamp, ns."""
-        ...
-
+from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams, Stamped
 
 F = TypeVar("F", bound=Stamped)
 C = TypeVar("C", bound=Stamped)

@@ -10,11 +10,21 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from typing import Protocol
 
 PATIENCE = 10
 """Frames that may wait for a stream: more than a player lets be on their way at once, so that a slow start of a replay
 is not taken for silence; a third of a second at 30 Hz.
 """
+
+
+class Stamped(Protocol):
+    """Anything with a header stamp."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """The stamp, ns."""
+        ...
 
 
 class AwaitedStreams:

@@ -13,23 +13,14 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
-from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams
+from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams, Stamped
 from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S
 from slam_core.rig_features import MOST_CAMERAS
 
 _ALONE = 2
 """Frames of a camera without the common trigger, beyond ``patience`` and unheard the others, after which it is used."""
-
-
-class Stamped(Protocol):
-    """Anything of one moment."""
-
-    @property
-    def stamp_ns(self) -> int:
-        """Header stamp, ns."""
-        ...
 
 
 T = TypeVar("T", bound=Stamped)
