@@ -22,7 +22,7 @@ from slam_core.geometry import (
     so3_log,
 )
 from slam_core.types import ImuSample, PressureReading
-from slam_simulation.lift import Ride as Journey
+from slam_simulation.lift import LiftRide as Journey
 
 STEP_NS, RATE, DT = 200_000_000, 100.0, 1e-3
 STANDS, SECONDS = 10.0, 26.0
