@@ -50,6 +50,14 @@ def test_without_a_reading_nearby_nothing_is_told() -> None:
     assert heights.since(90 * STEP_NS, 91 * STEP_NS) is None, "nothing was read before that start"
 
 
+def test_a_reading_is_measured_once() -> None:
+    heights = filled()
+    heights.start(19 * STEP_NS)
+    assert heights.since(19 * STEP_NS, 30 * STEP_NS) is not None
+    assert heights.since(19 * STEP_NS, 30 * STEP_NS + 1) is None
+    assert heights.since(19 * STEP_NS, 31 * STEP_NS) is not None
+
+
 @pytest.mark.parametrize(
     ("pascal", "stamp_ns", "count"),
     [

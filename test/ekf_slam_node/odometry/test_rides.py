@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -24,7 +26,7 @@ from slam_core.geometry import (
 from slam_core.types import ImuSample, PressureReading
 from slam_simulation.lift import LiftRide as Journey
 
-STEP_NS, RATE, DT = 200_000_000, 100.0, 1e-3
+RATE, DT = 100.0, 1e-3
 STANDS, SECONDS = 10.0, 26.0
 SEEN = np.repeat([1.5e-3, 5e-4], 3)
 """Standard deviations (m, rad) of a motion that the images show."""
@@ -74,6 +76,68 @@ def ideal(height: Callable[[float], float]) -> tuple[list[float], FloatArray]:
     return times, np.array(rows)
 
 
+@dataclass
+class Outcome:
+    """Rides that were found, how many were begun and retracted, and the last one's height while it goes on."""
+
+    rides: list[Ride]
+    begun: int
+    retracted: int
+    aids: RelativePoseBuffer
+
+
+def driven(
+    height: Callable[[float], float],
+    seed: int,
+    seen_height: Callable[[float], float] = stays,
+    pressure: Callable[[float], float] | None = None,
+    use: str = "imu",
+    fps: float = 5.0,
+    push: Callable[[float], float] = stays,
+    gap: tuple[float, float] = (-1.0, -1.0),
+    seconds: float = SECONDS,
+    is_live: bool = False,
+) -> Outcome:
+    """Rides that are found while the images show the motion within a storey, or ``seen_height`` of it.
+
+    push: error of the upward specific force at a time, m/s2; gap: readings of the IMU between two times are missing;
+    is_live: those after a frame are not known at it.
+    """
+    rng = np.random.default_rng(seed)
+    times, rows = ideal(height)
+    bias = np.concatenate([0.01 * rng.standard_normal(3), 0.05 * rng.standard_normal(3)])
+    density = np.repeat([NOISE.gyroscope_noise_density, NOISE.accelerometer_noise_density], 3)
+    rows = rows + bias + density * np.sqrt(RATE) * rng.standard_normal(rows.shape)
+    aids = RelativePoseBuffer(MotionConfig(), NOISE, None, RideConfig(use=use))
+    samples = deque(
+        ImuSample(round(t * 1e9), row[:3], row[3:] + push(t) * np.eye(3)[2])
+        for t, row in zip(times, rows, strict=True)
+        if not gap[0] <= t < gap[1]
+    )
+    if pressure is not None:
+        scale = 1.0 + 0.03 * rng.standard_normal()
+        walk = np.cumsum(0.02 * np.sqrt(0.1) * rng.standard_normal(int(SECONDS * 10) + 1))
+        for k, drift in enumerate(walk):
+            pascal = 1e5 * np.exp(-(scale * pressure(0.1 * k) + drift) / 8434.0) + 1.5 * rng.standard_normal()
+            assert not aids.rides.pressure.add(PressureReading(k * 10**8, pascal, 1.5**2))
+    rides, begun, retracted, step_ns = [], 0, 0, round(1e9 / fps)
+    for k in range(int(seconds * 1e9) // step_ns - 1):
+        start, end = k * step_ns, (k + 1) * step_ns
+        poses = [within_storey(1e-9 * at) for at in (start, end)]
+        for T, at in zip(poses, (start, end), strict=True):
+            T[2, 3] += seen_height(1e-9 * at)
+        seen = boxplus(invert_transform(poses[0]) @ poses[1], SEEN * rng.standard_normal(6))
+        while samples and (not is_live or samples[0].stamp_ns <= end + 1e9 / RATE):
+            aids.add_imu(samples.popleft())
+        aids.rides.forget_events()
+        aids.moved(start, end, seen, np.diag(SEEN**2))
+        begun += bool(aids.rides.begun)
+        retracted += aids.rides.is_retracted
+        if aids.rides.ended is not None:
+            rides.append(aids.rides.ended)
+    return Outcome(rides, begun, retracted, aids)
+
+
 def ridden(
     height: Callable[[float], float],
     seed: int,
@@ -81,35 +145,10 @@ def ridden(
     pressure: Callable[[float], float] | None = None,
     use: str = "imu",
 ) -> list[Ride]:
-    """The rides that are found while the images show the motion within a storey, or ``seen_height`` of it."""
-    rng = np.random.default_rng(seed)
-    times, rows = ideal(height)
-    bias = np.concatenate([0.01 * rng.standard_normal(3), 0.05 * rng.standard_normal(3)])
-    density = np.repeat([NOISE.gyroscope_noise_density, NOISE.accelerometer_noise_density], 3)
-    rows = rows + bias + density * np.sqrt(RATE) * rng.standard_normal(rows.shape)
-    aids = RelativePoseBuffer(MotionConfig(), NOISE, None, RideConfig(use=use))
-    for t, row in zip(times, rows, strict=True):
-        aids.add_imu(ImuSample(round(t * 1e9), row[:3], row[3:]))
-    if pressure is not None:
-        scale = 1.0 + 0.03 * rng.standard_normal()
-        walk = np.cumsum(0.02 * np.sqrt(0.1) * rng.standard_normal(int(SECONDS * 10) + 1))
-        for k, drift in enumerate(walk):
-            pascal = 1e5 * np.exp(-(scale * pressure(0.1 * k) + drift) / 8434.0) + 1.5 * rng.standard_normal()
-            assert not aids.rides.pressure.add(PressureReading(k * 10**8, pascal, 1.5**2))
-    rides = []
-    for k in range(int(SECONDS * 1e9) // STEP_NS - 1):
-        start, end = k * STEP_NS, (k + 1) * STEP_NS
-        poses = [within_storey(1e-9 * at) for at in (start, end)]
-        for T, at in zip(poses, (start, end), strict=True):
-            T[2, 3] += seen_height(1e-9 * at)
-        seen = boxplus(invert_transform(poses[0]) @ poses[1], SEEN * rng.standard_normal(6))
-        aids.rides.forget_events()
-        aids.moved(start, end, seen, np.diag(SEEN**2))
-        if aids.rides.ended is not None:
-            rides.append(aids.rides.ended)
-    assert aids.inertial.uses_force
-    assert not aids.rides.is_riding
-    return rides
+    outcome = driven(height, seed, seen_height, pressure, use)
+    assert outcome.aids.inertial.uses_force
+    assert not outcome.aids.rides.is_riding
+    return outcome.rides
 
 
 def test_heights_of_rides_are_honest() -> None:
@@ -167,3 +206,69 @@ def test_a_ride_that_a_barometer_confirms_is_found_from_its_start() -> None:
 def test_a_ride_down_is_one_too() -> None:
     (ride,) = ridden(lambda t: -by_lift(t), 5)
     assert ride.height == pytest.approx(-9.0, abs=0.5)
+
+
+def bobs(t: float) -> float:
+    return 0.025 * np.sin(2.0 * np.pi * 1.8 * t)
+
+
+def test_readings_that_are_missing_for_a_moment_are_no_ride() -> None:
+    """Someone who bobs is seen to, and the few readings that are missing make the IMU's way much less certain."""
+    for seed in range(3):
+        assert driven(bobs, seed, bobs, fps=10.0, gap=(20.0, 20.25)).begun == 0
+
+
+def test_an_accelerometer_whose_bias_jumps_is_in_no_lift_for_long() -> None:
+    outcome = driven(stays, 3, push=lambda t: 0.4 * (t > 15.0))
+    assert outcome.begun == outcome.retracted > 0
+    assert outcome.rides == []
+    assert not outcome.aids.rides.is_riding
+
+
+def test_a_force_that_is_wrong_on_the_way_widens_the_height_or_refutes_the_ride() -> None:
+    for push in (-0.03, 0.03):
+        (ride,) = driven(by_lift, 3, push=lambda t, push=push: push * (13.0 < t < 21.0)).rides
+        (right,) = ridden(by_lift, 3)
+        assert 4.0 * right.variance < ride.variance
+        assert abs(ride.height - 9.0) < 2.0 * np.sqrt(ride.variance)
+    wrong = driven(by_lift, 3, push=lambda t: -0.6 * (16.0 < t < 16.6))
+    assert (wrong.rides, wrong.begun, wrong.retracted) == ([], 1, 1)
+
+
+def test_a_ride_that_no_barometer_confirms_leaves_no_trace() -> None:
+    suspecting, off = (driven(by_lift, 5, pressure=stays, use=use).aids.inertial for use in ("auto", "off"))
+    np.testing.assert_array_equal(suspecting.covariance, off.covariance)
+    np.testing.assert_array_equal(suspecting.velocity, off.velocity)
+    assert suspecting.time_offset == off.time_offset
+    assert suspecting.fork()._clock is not suspecting._clock
+
+
+@pytest.mark.parametrize("gap", [(16.0, 16.45), (16.0, 17.6)])
+def test_readings_missing_on_the_way_widen_the_height(gap: tuple[float, float]) -> None:
+    errors = []
+    for seed in range(3):
+        (ride,) = driven(by_lift, seed, gap=gap, is_live=True).rides
+        (whole,) = ridden(by_lift, seed)
+        assert whole.variance < ride.variance < 9.0
+        errors.append((ride.height - 9.0) ** 2 / ride.variance)
+    assert max(errors) < 9.0
+
+
+@pytest.mark.parametrize("fps", [2.0, 2.5, 10.0, 30.0])
+def test_the_end_of_a_ride_is_seen_at_any_frame_rate(fps: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ekf_slam_node.odometry.inertial._MIN_JUDGED_STEPS", 10)
+    (ride,) = driven(by_lift, 2, fps=fps).rides
+    assert abs(ride.height - 9.0) < 3.5 * np.sqrt(ride.variance) < 1.0
+    assert 1e-9 * ride.end_ns < STANDS + JOURNEY.stay + 0.5
+
+
+def test_a_ride_at_the_end_of_a_session_counts_if_its_cabin_stands() -> None:
+    arrived = driven(by_lift, 1, seconds=STANDS + JOURNEY.wait + 9.3)
+    assert arrived.aids.rides.is_riding
+    ride = arrived.aids.rides.conclude()
+    assert ride is not None
+    assert abs(ride.height - 9.0) < 3.5 * np.sqrt(ride.variance) < 1.0
+    on_the_way = driven(by_lift, 1, seconds=STANDS + JOURNEY.wait + 5.0)
+    assert on_the_way.aids.rides.is_riding
+    assert on_the_way.aids.rides.conclude() is None
+    assert not on_the_way.aids.rides.is_riding

@@ -30,7 +30,7 @@ _IMPOSSIBLE = 25.0
 """And beyond which there was no ride, or its start was missed."""
 _LONGEST_NS, _FASTEST, _VAGUEST = 90_000_000_000, 6.0, 3.0
 """No ride takes longer, is faster (m/s) or as uncertain (standard deviation of its height, m)."""
-_SPEEDING_S, _SPEEDING = 4, 0.05
+_SPEEDING_S, _SPEEDING = 4, 0.08
 """No cabin gains so much speed (m/s) in each of so many seconds."""
 _OPEN = 10.0
 """Standard deviation (m) of the vertical motion for the inertial filter during a ride."""
@@ -80,6 +80,7 @@ class Cabin:
             config.sigma_pressure_scale, config.pressure_drift,
         )  # fmt: skip
         self._place, self._turn = np.zeros(3), np.eye(3)
+        self._gravity: float | None = None
         self._fastest, self._speeds = 0.0, deque[tuple[int, float]]()
         self._risen: list[tuple[int, float]] = [(first.start_ns, 0.0)]
         self.heights: list[HeightAt] = []
@@ -106,7 +107,7 @@ class Cabin:
         inertial, T = self.inertial, seen.T
         step = inertial.predict(seen.for_filter(inertial))
         up = inertial.up
-        self._filter.advance(_vertical(up, step.pre, inertial.gravity, T, seen.covariance), seen.end_ns)
+        self._filter.advance(_vertical(up, step.pre, self._known_gravity(), T, seen.covariance), seen.end_ns)
         if with_pressure:
             self._measure_pressure(seen.end_ns)
         carried = T.copy()
@@ -123,8 +124,8 @@ class Cabin:
         step = self.inertial.predict(pre)
         sigma = np.repeat([_UNSEEN_SPEED * step.dt, 1.0], 3)
         T = make_transform(step.T[:3, :3], np.zeros(3))
-        up, gravity = self.inertial.up, self.inertial.gravity
-        self._filter.advance(_vertical(up, pre, gravity, T, np.diag(sigma**2)), stamp_ns)
+        covariance = np.diag(sigma**2)
+        self._filter.advance(_vertical(self.inertial.up, pre, self._known_gravity(), T, covariance), stamp_ns)
         self.inertial.advance(step)
         self._note()
 
@@ -133,7 +134,14 @@ class Cabin:
         if stamp_ns > self._filter.stamp_ns:
             self._filter.go_on(stamp_ns)
             self._note()
-        self.inertial.forget_motion()
+        gravity = self.inertial.gravity
+        if self._gravity is None:
+            self._gravity = float(np.linalg.norm(gravity))
+        self.inertial.forget_motion(gravity)
+
+    def _known_gravity(self) -> FloatArray:
+        """Gravity (3,) at the newest frame: with its size before readings were missing, as a cabin's force differs."""
+        return self.inertial.gravity if self._gravity is None else -self._gravity * self.inertial.up
 
     def _measure_pressure(self, stamp_ns: int) -> None:
         told = self._pressure.since(self._filter.start_ns, stamp_ns)
@@ -200,6 +208,11 @@ class Cabin:
         speeds = speeds[first:]
         is_slow = bool(np.abs(speeds).max() < max(_SLOW_SHARE * self._fastest, _SLOW))
         return is_slow and bool(np.ptp(speeds) < _CONSTANT)
+
+    @property
+    def is_slow(self) -> bool:
+        """True if the cabin hardly moves any more."""
+        return abs(self._filter.speed) < _SLOW < self._fastest
 
     def concluded(self) -> Ride | None:
         """The ride, its cabin now at rest; None if the accelerometer's speed contradicts that by too much."""

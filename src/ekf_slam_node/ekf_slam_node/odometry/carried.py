@@ -59,12 +59,13 @@ def is_carried(seen: Sequence[Seen]) -> bool:
         return False
     if any(np.linalg.norm(s.T[:3, 3]) > STANDING_SPEED * s.pre.dt for s in seen) or not _has_steady_clock(seen):
         return False
-    apart, covariance = _apart(seen)
-    up = before.up
+    up, apart = before.up, _apart(seen)
     rise = float(up @ apart)
     aside = float(np.linalg.norm(apart - rise * up))
-    sigma = float(np.sqrt(max(before.variance_scale, 1.0) * up @ covariance @ up))
-    return abs(rise) > max(_SIGMAS * sigma, _LEAST) and aside < SIDEWAYS * abs(rise)
+    if abs(rise) <= _LEAST or aside >= SIDEWAYS * abs(rise):
+        return False
+    variance = max(before.variance_scale, 1.0) * float(up @ _apart_covariance(seen) @ up)
+    return abs(rise) > _SIGMAS * float(np.sqrt(variance))
 
 
 def _has_steady_clock(seen: Sequence[Seen]) -> bool:
@@ -72,25 +73,31 @@ def _has_steady_clock(seen: Sequence[Seen]) -> bool:
     return max(offsets) - min(offsets) < _STEADY_S and max(s.before.sigma_time_offset for s in seen) < _KNOWN_S
 
 
-def _apart(seen: Sequence[Seen]) -> tuple[FloatArray, FloatArray]:
-    """Way (3,) of the accelerometer less that of the images, along the first axes, m, with its covariance (3, 3)."""
+def _apart(seen: Sequence[Seen]) -> FloatArray:
+    """Way (3,) of the accelerometer less that of the images, along the first axes, m."""
     before = seen[0].before
     velocity, R, apart = before.velocity, np.eye(3), np.zeros(3)
-    J_gravity, J_way = np.eye(3, 13, 3), np.zeros((3, 13))
-    J_velocity = np.eye(3, 13)
-    noise, rows = np.zeros((6, 6)), np.array([6, 7, 8, 3, 4, 5])
     for one in seen:
         pre = one.for_filter(before)
-        dt = pre.dt
-        apart = apart + velocity * dt + 0.5 * dt**2 * before.gravity + R @ (pre.p - one.T[:3, 3])
-        velocity = velocity + before.gravity * dt + R @ pre.v
-        J_way = J_way + dt * J_velocity + 0.5 * dt**2 * J_gravity
+        apart = apart + velocity * pre.dt + 0.5 * pre.dt**2 * before.gravity + R @ (pre.p - one.T[:3, 3])
+        velocity = velocity + before.gravity * pre.dt + R @ pre.v
+        R = R @ one.T[:3, :3]
+    return apart
+
+
+def _apart_covariance(seen: Sequence[Seen]) -> FloatArray:
+    """Covariance (3, 3) of that way, m2."""
+    J_velocity, J_gravity, J_apart = np.eye(3, 13), np.eye(3, 13, 3), np.zeros((3, 13))
+    noise, rows, R = np.zeros((6, 6)), np.array([6, 7, 8, 3, 4, 5]), np.eye(3)
+    for one in seen:
+        pre, dt = one.pre, one.pre.dt
+        J_apart = J_apart + dt * J_velocity + 0.5 * dt**2 * J_gravity
         J_velocity = J_velocity + dt * J_gravity
-        J_way[:, 6:] += R @ pre.J[6:]
+        J_apart[:, 6:] += R @ pre.J[6:]
         J_velocity[:, 6:] += R @ pre.J[3:6]
         F, turn = np.eye(6), both_halves(R)
         F[:3, 3:] = dt * np.eye(3)
         noise = F @ noise @ F.T + turn @ pre.covariance[np.ix_(rows, rows)] @ turn.T
         noise[:3, :3] += R @ one.covariance[:3, :3] @ R.T
         R = R @ one.T[:3, :3]
-    return apart, J_way @ before.covariance @ J_way.T + noise[:3, :3]
+    return np.asarray(J_apart @ seen[0].before.covariance @ J_apart.T + noise[:3, :3])

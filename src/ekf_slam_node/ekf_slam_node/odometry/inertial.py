@@ -113,12 +113,17 @@ class InertialFilter:
         other._clock = copy.copy(self._clock)
         return other
 
-    def forget_motion(self) -> None:
-        """Velocity and gravity are unknown from here on: readings were missing. The biases and the clock stay."""
+    def forget_motion(self, gravity: FloatArray | None = None) -> None:
+        """Velocity and gravity are unknown from here on: readings were missing. The biases and the clock stay.
+
+        gravity: (3,) m/s2, to tell the vertical until the next reading.
+        """
         self.velocity, self.gravity = np.zeros(3), np.zeros(3)
         biases = self.covariance[B, B].copy()
         self.covariance = np.zeros((13, 13))
         self.covariance[B, B] = biases
+        if gravity is not None:
+            self.gravity, self.covariance[G, G] = gravity, np.eye(3) * _HAND_SHAKE**2
         self._steps = 0
         self._is_sized = False
 

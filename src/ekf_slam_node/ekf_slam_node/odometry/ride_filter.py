@@ -27,7 +27,7 @@ _SIGMA_REST = 0.03
 """By how much (m/s) a cabin that has arrived may still move."""
 _SPEED_NS = 400_000_000
 """The cabin's speed is its mean over at least so long."""
-_UNREAD_ACCELERATION, _UNREAD_FORCE = 1.0, 0.1
+_UNREAD_ACCELERATION, _UNREAD_FORCE = 0.5, 0.05
 """Acceleration of a cabin over missing readings, and error of the vertical force after them, m/s2."""
 
 

@@ -125,11 +125,12 @@ class RideWatch:
     def unread(self, inertial: InertialFilter, stamp_ns: int) -> None:
         """Go on to a stamp over readings that are missing."""
         self._forget_motions()
-        inertial.forget_motion()
-        if self._cabin is not None:
-            assert self._standing is not None
-            self._standing.forget_motion()
-            self._cabin.unread(stamp_ns)
+        if self._cabin is None:
+            inertial.forget_motion()
+            return
+        assert self._standing is not None
+        self._standing.forget_motion()
+        self._cabin.unread(stamp_ns)
 
     def without_ride(self, inertial: InertialFilter, T: FloatArray) -> FloatArray:
         """Motion T (4, 4) that the IMU tells, as one within the cabin during a ride: without its rise."""
@@ -140,10 +141,10 @@ class RideWatch:
         return within
 
     def conclude(self) -> Ride | None:
-        """End a ride because mapping ends: None if there is none, or its cabin was not at rest yet."""
+        """End a ride because mapping ends: None if there is none, or its cabin had not stopped yet."""
         cabin, self._cabin, self._standing = self._cabin, None, None
         self._forget_motions()
-        if cabin is None or not cabin.is_at_rest:
+        if cabin is None or not cabin.is_slow:
             return None
         self.pressure_refused += cabin.pressure_refused
         return cabin.concluded()
@@ -174,7 +175,7 @@ class RideWatch:
             return cabin.inertial
         standing = self._standing
         assert standing is not None
-        self.ended = None if cabin.is_impossible else cabin.concluded()
+        self.ended = cabin.concluded() if cabin.has_ended else None
         self.is_retracted = self.ended is None
         self.pressure_refused += cabin.pressure_refused
         self._cabin, self._standing = None, None
