@@ -27,16 +27,16 @@ class Chain:
     ends: list[tuple[float, float]] = field(default_factory=list)
     raised: list[float] = field(default_factory=list)
 
-    def raise_path(self, heights, up) -> None:
+    def raise_path(self, heights: tuple[HeightAt, ...], up: object) -> None:
         self.raised += [at.height for at in heights]
 
-    def displace(self, height, variance, up) -> None:
+    def displace(self, height: float, variance: float, up: object) -> None:
         self.ends.append((height, variance))
 
     def close(self) -> tuple[str, ...]:
         return ("submap",)
 
-    def follow(self, *_) -> None:
+    def follow(self, *_: object) -> None:
         pass
 
 
