@@ -110,7 +110,7 @@ class _Task:
 
 @dataclass(frozen=True, eq=False)
 class _Handle:
-    """What asks for the result of a task, which the cluster keeps as long."""
+    """Keeps the result of a task on the cluster, and asks for it."""
 
     task: _Task
 
