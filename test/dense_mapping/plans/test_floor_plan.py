@@ -167,6 +167,17 @@ def test_two_storeys_are_two_floors():
     np.testing.assert_allclose(floor_heights(points, normals, cameras[:1], 2.0, 1.3), [0.0], atol=0.01)
 
 
+def test_a_storey_that_was_seen_little_has_its_floor_all_the_same():
+    rng = np.random.default_rng(0)
+    upper = np.column_stack([rng.uniform(0, 5, (4000, 2)), rng.normal(3.0, 0.01, 4000)])
+    lower, noise = upper[:450] - np.array([0, 0, 3.0]), upper[:60] + np.array([0, 0, 3.0])
+    points = np.concatenate([upper, lower, noise])
+    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    cameras = np.array([[1, 1, z] for z in (1.3, 1.3, 1.3, 4.3, 4.3, 4.3, 7.3, 7.3, 7.3)])
+    np.testing.assert_allclose(floor_heights(points, normals, cameras, 2.0, 1.3), [0.0, 3.0], atol=0.01)
+    np.testing.assert_allclose(floor_heights(points, normals, cameras[2:6], 2.0, 1.3), [3.0], atol=0.01)
+
+
 def test_levelling_turns_up_into_z(rng):
     for up in rng.normal(size=(20, 3)):
         up = up / np.linalg.norm(up)

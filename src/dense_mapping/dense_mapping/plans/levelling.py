@@ -18,6 +18,10 @@ _GRAVITY_CONES_DEG = (5.0, 3.0)
 """Surfaces that are level to this angle are taken for floors and ceilings, step by step."""
 _BIN_M = 0.05
 _UPWARD = 0.9
+_LEAST_SHARE = 0.15
+"""A floor is seen at least as much, of what is seen most of all level surfaces."""
+_SURELY_WALKED, _LEAST_STOREY = 3, 0.5
+"""Below so many key frames the share is that of its own storey, which may be seen this much less than another one."""
 
 
 def up_direction(surface: Surface, image_ups: FloatArray, gravity_up: FloatArray | None = None) -> FloatArray:
@@ -86,7 +90,9 @@ def floor_heights(
     walked = ((above > 0.3) & (above < storey_height)).sum(axis=1)
     for k in np.argsort(-counts * walked, kind="stable"):
         height = float(middles[k])
-        is_floor = counts[k] >= 0.15 * counts.max() and walked[k] > 0
+        nearby = counts[np.abs(middles - height) < storey_height].max()
+        most = counts.max() if walked[k] < _SURELY_WALKED else max(nearby, _LEAST_STOREY * counts.max())
+        is_floor = counts[k] >= _LEAST_SHARE * most and walked[k] > 0
         if is_floor and all(abs(height - other) >= storey_height for other in floors):
             floors.append(float(np.median(below[np.abs(below - height) < 0.1])))
     return np.array(sorted(floors)) if floors else np.array([float(np.percentile(below, 5))])
