@@ -37,9 +37,9 @@ class Probe:
             self.node.create_subscription(message_type, topic, self.received[topic].append, profile)
         )
 
-    def send(self, topic: str, message: Any) -> None:
+    def send(self, topic: str, message: Any, *, latched: bool = False) -> None:
         if topic not in self.senders:
-            self.senders[topic] = self.node.create_publisher(type(message), topic, sensor_qos(100))
+            self.senders[topic] = self.node.create_publisher(type(message), topic, sensor_qos(100, latched))
             self.wait(lambda: self.senders[topic].get_subscription_count() > 0, f"nobody listens to {topic}")
             self._let_others_find_us()
         self.senders[topic].publish(message)

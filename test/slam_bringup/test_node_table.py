@@ -14,6 +14,7 @@ from slam_core.config import Config
 
 EVERY_SENSOR = {
     "feature_extractor": [("mode:=fuse",)],
+    "sjsam": [("autosave_period_s:=0.0",)],
     "radio_link": [(f"role:={role}", "agents:=['anna']", "connect:=['tcp/127.0.0.1:1']") for role in ("agent", "post")],
 }
 """Parameters with which a node has all its topics, some here and some there."""

@@ -110,7 +110,9 @@ def test_submaps_poses_and_corrections_cross_the_link_and_survive_its_silence(
 
             probe.wait(is_corrected, f"no correction at the agent: {logs()}")
             correction = probe.received["/helmet/map_to_odom"][-1]
-            probe.send("/map/undecided", submap_keys_message(types, 10**9, [("anna", 2, 1), ("bert", 2, 0)]))
+            probe.send(
+                "/map/undecided", submap_keys_message(types, 10**9, [("anna", 2, 1), ("bert", 2, 0)]), latched=True
+            )
             wait_for(3)
             detailed = submap_from_messages(SubmapMessages(*received()[-1]))
             assert probe.call("/radio_link/request_details").message == "details of 1 submaps asked for"
