@@ -59,7 +59,7 @@ class End:
         """Keep what waits and what has come for the next start."""
 
     def tell_strangers(self, strangers: Mapping[Path, int], use: str) -> None:
-        """Say which files of before this program cannot read; they stay where they are."""
+        """Say how many files, of an earlier version or damaged, cannot be read; they stay where they are."""
         for folder, count in strangers.items():
             self.node.health.count("files of another version", count)
             self.node.get_logger().warning(
