@@ -7,16 +7,15 @@ Features in, poses, landmarks and finished submaps out (thesis chapter 6, Algori
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
-from ekf_slam_node.association.linking import CONVINCING, FrameLink, Linker
+from ekf_slam_node.association.linking import Linker
 from ekf_slam_node.config import MAX_FRAME_FEATURES, MAX_UPDATE_LANDMARKS, STANDING_FRAMES, EkfSlamConfig
-from ekf_slam_node.filtering.candidates import Candidates, MotionPrior, motion_prior
 from ekf_slam_node.filtering.correlated_noise import CORRELATED_NOISE_FACTOR, CorrelatedNoise
 from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.filtering.noise_monitor import InnovationWatch, NoiseMonitor
+from ekf_slam_node.frame_association import FrameAssociation
 from ekf_slam_node.loss_recovery import LossRecovery
 from ekf_slam_node.odometry.relative_poses import (
     ALL,
@@ -31,20 +30,16 @@ from ekf_slam_node.submaps.frame_input import LinkedCameras, frame_of_strongest,
 from ekf_slam_node.submaps.missed_frames import MissedFrames
 from ekf_slam_node.submaps.motion_checks import (
     StandingDetector,
-    fused_prior,
     inflated_process_noise,
     is_surprising,
     widened,
 )
 from ekf_slam_node.submaps.open_submap import LandmarkMatches
 from ekf_slam_node.submaps.rolling_shutter import RollingShutter
-from ekf_slam_node.submaps.steps import LinkedFrame, UpdatedFrame
+from ekf_slam_node.submaps.steps import LinkedFrame, UpdatedFrame, sureness
 from ekf_slam_node.submaps.submap_chain import SubmapChain
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
 from slam_core.types import Counters, Features, ImuSample, OdometryReading, PressureReading, RelativeMotion, Submap
-
-MOVING = "moving_objects"
-"""Name of things that move in the counters: ``frames_with_moving_objects``, ``features_on_moving_objects``."""
 
 
 class EkfSlam:
@@ -101,9 +96,12 @@ class EkfSlam:
         self._next_id = 0
         self._newest_stamp_ns = 0
         self._tags: Frame | None = None
+        self._located: Frame | None = None
         self._linked_cameras = LinkedCameras()
         self._standing = StandingDetector(STANDING_FRAMES, self.config.association.gate)
         missed = MissedFrames(self._linker, self._T_rig_optical, self.config.motion)
+        known = self._chain, self._aids, self._linker, self._shutter
+        self._association = FrameAssociation(self.config, *known, self.counters)
         self._rides = RideSubmaps(self._chain, self._aids, self.counters)
         self._recovery = LossRecovery(self.config, self._chain, self._aids, missed, self.counters, self._advance)
 
@@ -128,6 +126,8 @@ class EkfSlam:
         if not self._chain.is_open:
             self._linked_cameras.take(frame)
             return self._recovery.begin(frame)
+        if features.is_pose_only:
+            return self._locate(frame)
         slips = self._aids.external.slips
         self._aids.rides.forget_events()
         try:
@@ -224,9 +224,10 @@ class EkfSlam:
 
         It ends where an odometry has carried the rig to, if the last frames had no link.
         """
+        before = self._advance_to_located() if self._chain.is_open else None
         self._recovery.end_where_odometry_is()
         self._rides.end_early()
-        return self._chain.finish()
+        return (() if before is None else before.submaps) + self._chain.finish()
 
     # ----------------------------------------------------------------------------------------------------- Algorithm 3
     def _advance(self, frame: Frame) -> EkfResult:
@@ -234,6 +235,10 @@ class EkfSlam:
         dt = seconds_between(self._chain.stamp_ns, frame.stamp_ns)
         aid = self._aids.between(self._chain.stamp_ns, frame.stamp_ns)
         linked = self._link(frame, dt, aid)
+        if linked is None and (before := self._advance_to_located()) is not None:
+            result = self._advance(frame)
+            return replace(result, submaps=before.submaps + result.submaps)
+        self._located = None
         if linked is None and aid is not None and aid.rows == ALL and aid.source == "scans":
             return self._recovery.dead_reckon(frame, dt, aid)
         bridge = None
@@ -258,23 +263,39 @@ class EkfSlam:
         submaps = self._close(linked, seen, updated) if updated.closes else self._maintain(linked, updated)
         return self._chain.result(frame.stamp_ns, *updated.state(linked.link), submaps, updated)
 
+    def _locate(self, frame: Frame) -> EkfResult:
+        """Tell where the rig is by a frame that maps nothing: the filter stays at the last one that does.
+
+        The pose is that of the landmarks and of the last mapping frame's other features, as the filter's pose has them
+        around it.
+        """
+        dt = seconds_between(self._chain.stamp_ns, frame.stamp_ns)
+        aid = self._aids.between(self._chain.stamp_ns, frame.stamp_ns)
+        try:
+            found = self._association.of(frame, dt, aid, maps=False)
+        except np.linalg.LinAlgError:
+            found = None
+        if found is None:
+            return self._recovery.pass_over(frame)
+        covariance = found.link.covariance + np.diag(self._common.sigma(frame) ** 2)
+        pose = self._chain.add_located_pose(frame.stamp_ns, found.link.T, covariance)
+        self._located = frame
+        self.counters.add("frames_pose_only")
+        state, reason = sureness(found.link)
+        return self._chain.result(frame.stamp_ns, state, reason, pose=pose)
+
+    def _advance_to_located(self) -> EkfResult | None:
+        """Let the filter move to the last frame that told its pose alone, if there is one since it moved last."""
+        frame, self._located = self._located, None
+        return None if frame is None else self._advance(frame)
+
     def _link(self, frame: Frame, dt: float, aid: RelativePoseMeasurement | None) -> LinkedFrame | None:
         """Associate a frame with what is known, and learn its noise from the pairs; None if nothing fits."""
-        local = self._chain.local
-        expected = motion_prior(local.velocity, local.velocity_covariance(), self.config.motion.sigma, dt)
-        prior = fused_prior(expected, aid)
-        known = None if aid is None else prior.T
-        predicted = self._shutter.corrected(frame, dt, known)
-        candidates = local.candidates()
-        link = self._linker.link(candidates, predicted, prior, partial(self._is_inconsistent, frame.stamp_ns))
-        if link is None:
+        found = self._association.of(frame, dt, aid)
+        if found is None:
             return None
-        link = self._without_moving(frame.stamp_ns, candidates, predicted, expected, link)
-        if link is None:
-            return None
-        if link.moving:
-            self.counters.add(f"frames_with_{MOVING}")
-            self.counters.add(f"features_on_{MOVING}", link.moving)
+        link, expected = found.link, found.expected
+        known = None if aid is None else found.prior.T
         measured = self._noise.learn(frame, link.variance_scale)
         frame = self._shutter.corrected(measured, dt, link.T if known is None else known)
         if link.wrong is not None:
@@ -285,39 +306,7 @@ class EkfSlam:
         surprising = is_surprising(link, expected, self.config.association.gate)
         common = self._common.sigma(frame)
         aid = None if aid is None else widened(aid, common)
-        return LinkedFrame(frame, measured, dt, link, aid, common, surprising, len(local.table))
-
-    def _without_moving(
-        self, stamp_ns: int, candidates: Candidates, frame: Frame, expected: MotionPrior, link: FrameLink
-    ) -> FrameLink | None:
-        """The link, or where the IMU contradicts it that of the features which agree with the IMU, if there are any.
-
-        None if there are not, and few features have made the link: the IMU bridges the frame.
-        """
-        told = self._aids.witness(self._chain.stamp_ns, stamp_ns)
-        if told is None:
-            return link
-        if not contradicts(told, link.T, link.covariance, RELATIVE_POSE_GATE):
-            return replace(link, is_sure=True)
-        dt = seconds_between(self._chain.stamp_ns, stamp_ns)
-        other = self._linker.link_at(candidates, frame, fused_prior(expected, told), link.variance_scale)
-        if other is None or contradicts(told, other.T, other.covariance, RELATIVE_POSE_GATE):
-            is_convincing = len(link.rows) >= CONVINCING * min(len(candidates), len(frame))
-            if told.rows != ALL or is_convincing or self._aids.suspects_ride(told, link.T, dt):
-                return link
-            self._aids.add_inconsistency(stamp_ns)
-            self.counters.add("links_refuted")
-            return None
-        moving = np.setdiff1d(link.columns, other.columns)
-        self._linker.mark_moving(frame, moving)
-        return replace(other, moving=link.moving + len(moving))  # which the IMU is sure of
-
-    def _is_inconsistent(self, stamp_ns: int, link: FrameLink) -> bool:
-        """True if looks alone have led to a place where the IMU says that the rig cannot be."""
-        if not self._aids.is_inconsistent(self._chain.stamp_ns, stamp_ns, link.T, link.covariance):
-            return False
-        self.counters.add("links_refuted")
-        return True
+        return LinkedFrame(frame, measured, dt, link, aid, common, surprising, len(self._chain.local.table))
 
     def _augment(self, linked: LinkedFrame) -> LandmarkMatches:
         """Add the landmarks that the frame confirms, at the previous pose; returns all landmarks that it sees."""
@@ -363,7 +352,7 @@ class EkfSlam:
 
     def _measure_tags(self, linked: LinkedFrame, updated: UpdatedFrame) -> None:
         """Measure the frame's fiducial tags; where the submap ends, the pose bears the common error already."""
-        if self._tags is None:
+        if self._tags is None or self._tags.stamp_ns != linked.frame.stamp_ns:
             return
         tags = self._shutter.corrected(self._tags, linked.dt, linked.link.T)
         report = self._chain.local.measure_tags(tags, np.zeros(6) if updated.closes else linked.common)

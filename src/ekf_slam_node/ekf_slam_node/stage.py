@@ -19,8 +19,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.frame_association import MOVING
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
-from ekf_slam_node.slam import MOVING, EkfSlam
+from ekf_slam_node.slam import EkfSlam
 from slam_core.config import parameter
 from slam_core.frame_tree import FrameTree
 from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams

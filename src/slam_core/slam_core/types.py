@@ -33,13 +33,15 @@ LONGEST_IMU_STEP_S = 0.05
 class FeatureSource(IntEnum):
     """Source of a feature's depth; the values of the ``source`` field of the ``features`` topic.
 
-    ``TAG``: a corner of a fiducial tag, with depth from the tag's pose (:mod:`slam_core.tags`).
+    ``TAG``: a corner of a fiducial tag, with depth from the tag's pose (:mod:`slam_core.tags`). ``PREDICTED``: none was
+    measured; it is the depth that the frames before and the motion since predict, so that the direction alone counts.
     """
 
     STEREO = 0
     TOF = 1
     FUSED = 2
     TAG = 3
+    PREDICTED = 4
 
 
 MakeColour = Callable[[], ByteArray | None]
@@ -157,6 +159,11 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.uv)
+
+    @property
+    def is_pose_only(self) -> bool:
+        """True if no depth was measured: the frame tells where the rig is, and nothing new of the landmarks."""
+        return len(self) > 0 and bool((self.source == FeatureSource.PREDICTED).all())
 
     def joined(self, others: Features) -> Features:
         """Features with others of the same instant after them."""

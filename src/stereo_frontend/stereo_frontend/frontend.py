@@ -26,7 +26,8 @@ from stereo_frontend.stereo.pair_clock import PairClock
 from stereo_frontend.stereo.self_calibration import StereoSelfCalibration
 from stereo_frontend.stereo_depth import StereoDepth
 from stereo_frontend.tof_depth import TofDepth
-from stereo_frontend.tracking.tracked_features import begun, followed
+from stereo_frontend.tracking.mapping_pace import MappingPace
+from stereo_frontend.tracking.tracked_features import begun, followed, pose_only
 from stereo_frontend.tracking.tracker import LONGEST_STEP_S, Tracker
 
 _MAX_RELATIVE_SIGMA = 0.35
@@ -62,7 +63,8 @@ class Frontend:
         self._tof_depth = TofDepth(self.config, self.counters)
         longest_step_s = TOF_LONGEST_STEP_S if self.config.mode == "tof" else LONGEST_STEP_S
         self._tracker = Tracker(features.max_tracks, longest_step_s) if self.config.tracks else None
-        self._tof = TofFeatures(self.config.tof, features, self.config.noise, self._tracker, self._device)
+        self._pace = MappingPace(features.mapping_interval)
+        self._tof = TofFeatures(self.config.tof, features, self.config.noise, self._tracker, self._pace, self._device)
 
     def process(
         self, images: StereoImages | None, depth: DepthImage | None = None, T_left_tof: FloatArray | None = None
@@ -150,9 +152,13 @@ class Frontend:
     def _tracked(
         self, tracker: Tracker, images: StereoImages, depth: DepthImage | None, T_left_tof: FloatArray | None
     ) -> list[MeasuredKeypoints]:
-        """Tracks that were followed into the pair; in a frame that has few of them new keypoints, too."""
-        camera, sigma, parts = images.stereo.camera, self._stereo_depth.noise.sigma, []
+        """Tracks that were followed into the pair; new keypoints, too, in a frame that maps and has few of them."""
+        camera, sigma = images.stereo.camera, self._stereo_depth.noise.sigma
         tracks = tracker.follow(images.left, camera, images.stamp_ns, images.mask)
+        if tracks is not None and self._pace.is_pose_only(tracker, tracks, images.stamp_ns, camera):
+            self.counters.add("frames_pose_only")
+            return [pose_only(tracks, sigma)]
+        parts: list[MeasuredKeypoints] = []
         if tracks is not None:
             self.pair_clock.move(images.stamp_ns, *tracker.motion)
             stereo = self._stereo_depth.of_tracks(images, tracks)
@@ -164,6 +170,7 @@ class Frontend:
             self.counters.add("key_frames")
             left, estimate = self._detected(images, self._extract(images), depth, T_left_tof)
             parts.append(begun(tracker, number, images.left, left, estimate, camera, sigma))
+        self._pace.mapped(images.stamp_ns, parts)
         return parts
 
     @property
@@ -182,6 +189,7 @@ class Frontend:
             part.reset()
         if self._tracker is not None:
             self._tracker.reset()
+        self._pace.reset()
         self.counters.counts.clear()
 
     @property

@@ -11,6 +11,7 @@ from stereo_frontend.depth.depth_lookup import sample_depth
 from stereo_frontend.depth.tof_features import TofFeatureConfig, TofFeatures, normalised_picture
 from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.stereo.pixel_noise import PixelNoiseConfig
+from stereo_frontend.tracking.mapping_pace import MappingPace
 
 
 def twin(values, clip, gamma):
@@ -41,7 +42,7 @@ def test_features_are_those_of_all_keypoints_less_those_without_depth(stereo_pai
     depth[:, :150] = np.nan
     sigma = np.full(pair.left.shape, 0.01, np.float32)
     image = DepthImage(1, depth, sigma, pair.stereo.camera, amplitude=pair.left.astype(np.float32))
-    tof = TofFeatures(TofFeatureConfig(), FeatureConfig(target=200), PixelNoiseConfig(), None)
+    tof = TofFeatures(TofFeatureConfig(), FeatureConfig(target=200), PixelNoiseConfig(), None, MappingPace(0.0))
     features = tof(image)
     every = FeatureExtractor(FeatureConfig(target=200))(tof.picture(image, "amplitude"))
     known = np.isfinite(sample_depth(image, every.uv).depth)

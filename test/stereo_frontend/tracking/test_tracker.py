@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slam_core.config import from_mapping
-from slam_core.types import DepthImage, Features, StereoImages
+from slam_core.types import DepthImage, Features, FeatureSource, StereoImages
 from stereo_frontend.detection.features import TRACKING
 from stereo_frontend.frontend import Frontend
 from stereo_frontend.frontend_config import MODES, FrontendConfig
@@ -21,7 +21,9 @@ FLOW = np.array([4.3, -2.2])
 
 
 def tracking_frontend(mode: str = "stereo") -> Frontend:
-    return Frontend(from_mapping(FrontendConfig, {"mode": mode, "features.target": 300, "features.tracking": "always"}))
+    """A front end all of whose frames map."""
+    wanted = {"features.target": 300, "features.tracking": "always", "features.mapping_interval": 0.0}
+    return Frontend(from_mapping(FrontendConfig, {"mode": mode, **wanted}))
 
 
 def moved(pair: StereoImages, frames: int) -> StereoImages:
@@ -191,3 +193,26 @@ def test_pictures_far_apart_in_time_are_detected_anew(stereo_pair, mode, step_s,
     followed = np.intersect1d(first.track_ids, now.track_ids[now.track_ids > 0])
     assert (len(followed) > 60) == is_followed
     assert is_followed or (len(followed) == 0 and len(now) > 0.9 * len(first))
+
+
+def frames_of(frontend: Frontend, stereo_pair, count: int) -> list[Features]:
+    return [frontend.process(moved(stereo_pair(), k)) for k in range(count)]
+
+
+def test_every_second_frame_of_a_slow_camera_tells_the_pose_alone(stereo_pair):
+    frontend = Frontend(from_mapping(FrontendConfig, {"features.target": 300, "features.mapping_interval": 0.2}))
+    frames = frames_of(frontend, stereo_pair, 5)
+    assert [f.is_pose_only for f in frames] == [False, True, False, True, False]
+    assert frontend.counters.counts["frames_pose_only"] == 2
+    between, before = frames[1], frames[0]
+    _, now, then = np.intersect1d(between.track_ids, before.track_ids, return_indices=True)
+    assert len(now) == len(between) > 60
+    assert (between.source == FeatureSource.PREDICTED).all()
+    np.testing.assert_allclose(between.sigma_depth, 0.25 * between.depth, rtol=1e-5)
+    np.testing.assert_allclose(between.depth[now], before.depth[then], rtol=0.1)  # along the wall
+
+
+@pytest.mark.parametrize("changed", [{"features.mapping_interval": 0.0}, {"features.tracking": "never"}])
+def test_all_frames_map_where_that_is_asked_for(stereo_pair, changed):
+    frontend = Frontend(from_mapping(FrontendConfig, {"features.target": 300, **changed}))
+    assert not any(f.is_pose_only for f in frames_of(frontend, stereo_pair, 3))

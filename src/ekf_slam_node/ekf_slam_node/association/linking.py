@@ -95,16 +95,21 @@ class Linker:
         frame: Frame,
         prior: MotionPrior,
         is_refuted: Callable[[FrameLink], bool] = lambda link: False,
+        maps: bool = True,
     ) -> FrameLink | None:
         """Pairs of candidates and features and their motion; None if the frame cannot be linked.
 
-        ``is_refuted`` is asked of what looks alone have found: places may look the same.
+        ``is_refuted`` is asked of what looks alone have found: places may look the same. ``maps``: False for a frame
+        that tells the pose alone, whose tracks do without other pairs and without their depths' word on the noise.
         """
         if min(len(candidates), len(frame)) < self._config.min_inliers:
             return None
         # Seeded by the frame's own stamp: the samples do not depend on what happened before.
         rng = np.random.default_rng((self._config.seed, frame.stamp_ns))
-        predicted = self._by_tracks(candidates, frame, prior, rng)
+        predicted = self._by_tracks(candidates, frame, prior, rng, maps)
+        if predicted is not None and maps:
+            smaller = np.minimum(predicted.variance_scale, 1.0)
+            self._variance_scale = 0.9 * self._variance_scale + 0.1 * smaller
         if predicted is None:
             predicted = self._by_prediction(candidates, frame, prior, rng)
         known = min(len(candidates), len(frame))
@@ -137,7 +142,7 @@ class Linker:
         self._moving.mark(frame.tracks[columns])
 
     def _by_tracks(
-        self, candidates: Candidates, frame: Frame, prior: MotionPrior, rng: np.random.Generator
+        self, candidates: Candidates, frame: Frame, prior: MotionPrior, rng: np.random.Generator, maps: bool
     ) -> FrameLink | None:
         """The pairs that the front end has followed, and what of the rest fits their motion; None if these are few."""
         config = self._config
@@ -159,12 +164,12 @@ class Linker:
         guess = guess_motion(*followed, self._T_rig_optical, rng, _TRACK_HYPOTHESES, config.gate, initial)
         if guess is None or guess.inliers.sum() < max(config.min_inliers, 0.5 * len(rows)):
             return None
-        more = self._of_the_rest(candidates, frame, guess, rows, columns)
-        rows, columns = np.concatenate([rows, more[0]]), np.concatenate([columns, more[1]])
+        if maps:
+            more = self._of_the_rest(candidates, frame, guess, rows, columns)
+            rows, columns = np.concatenate([rows, more[0]]), np.concatenate([columns, more[1]])
         link = self._link_of(candidates, frame, guess.T, rows, columns, config.min_inliers)
         if link is None:
             return None
-        self._variance_scale = 0.9 * self._variance_scale + 0.1 * np.minimum(link.variance_scale, 1.0)
         moving = marked + (0 if two is None else len(two.moving))
         is_sure = moving < _ALIKE * len(link.rows) and (two is None or two.is_larger)
         return replace(link, moving=moving, is_sure=is_sure)

@@ -259,7 +259,8 @@ class OpenSubmap:
         z, variance = seen.z, seen.variance * self._noise_factors(sight)
         found = sighted_by(self._ekf.sighted, seen, variance, sight.slots, self._T_rig_optical, common)
         good = np.flatnonzero((found.nis < self._config.association.gate) & (found.seen.depth > MIN_DEPTH))
-        is_followed = 2 * np.sum(frame.tracks[sight.columns] > 0) > len(sight)
+        tracks = frame.tracks[sight.columns]
+        is_followed = 2 * np.sum((tracks > 0) & (tracks == self.table.tracks[sight.slots])) > len(sight)
         used = most_telling(found.information, good, self._config.landmark.most_measured) if is_followed else good
         report = self._ekf.update(z[used], variance[used], found.seen.select(used), sight.slots[used], common)
         after = observed_by(seen, self._ekf.T, self._T_rig_optical, self._ekf.landmarks[sight.slots])

@@ -8,12 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekf_slam_node.association.linking import FrameLink
+from ekf_slam_node.filtering.candidates import MotionPrior
 from ekf_slam_node.filtering.ekf import UpdateReport
 from ekf_slam_node.filtering.models import Frame
 from ekf_slam_node.odometry.relative_poses import RelativePoseMeasurement
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.submaps.open_submap import LandmarkMatches
 from slam_core.geometry import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Associated:
+    """Pairs of a frame, and its motion as it was expected and as other sensors have told it, too (``prior``)."""
+
+    link: FrameLink
+    expected: MotionPrior
+    prior: MotionPrior
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +68,12 @@ class UpdatedFrame:
         """State of the filter after the frame, and its reason."""
         if not self.report.applied:
             return TrackingState.DEGRADED, "no landmark could be measured, moved by the prediction alone"
-        if not link.is_sure:
-            counts = f"{link.moving} features move against the {len(link.rows)} that the pose rests on"
-            return TrackingState.DEGRADED, f"moving objects: {counts}, and nothing else tells which are the room"
+        return sureness(link)
+
+
+def sureness(link: FrameLink) -> tuple[TrackingState, str]:
+    """State of the filter after a frame with such a link, and its reason."""
+    if link.is_sure:
         return TrackingState.OK, ""
+    counts = f"{link.moving} features move against the {len(link.rows)} that the pose rests on"
+    return TrackingState.DEGRADED, f"moving objects: {counts}, and nothing else tells which are the room"

@@ -39,6 +39,8 @@ class SubmapBuilder:
         self._path = [PoseEstimate(start_stamp_ns, np.eye(4), ORIGIN_SIGMA**2 * np.eye(6))]
         self._standing = 0
         self._bridged: list[BridgedPose] = []
+        self._located: list[PoseEstimate] = []
+        self._mapping = 1
 
     def add_pose(self, pose: PoseEstimate, standing: bool = False) -> None:
         """Add the filter's present pose to the path; one of a rig that stands does not make the submap older."""
@@ -46,7 +48,14 @@ class SubmapBuilder:
         if self._bridged and self._bridged[-1].stamp_ns == pose.stamp_ns:
             self._path += smoothed(self._bridged, pose)
         self._bridged = []
+        self._path += self._located
+        self._located = []
+        self._mapping += 1
         self._path.append(pose)
+
+    def add_located_pose(self, pose: PoseEstimate) -> None:
+        """Add a pose of a frame that maps nothing; it is in the submap once a pose of the filter follows."""
+        self._located.append(pose)
 
     @property
     def is_bridging(self) -> bool:
@@ -82,11 +91,11 @@ class SubmapBuilder:
         size = max(
             float(np.linalg.norm(local.T[:3, 3])) / config.max_distance,
             len(local.table) / config.max_landmarks,
-            (len(self._path) - self._standing) / config.max_frames,
+            (self._mapping - self._standing) / config.max_frames,
             age / _FOUND_AGAIN_S if is_lost else 0.0,
         )
         limit = 1.0 if shared >= _MIN_SHARED else 2.0
-        return len(self._path) >= _MIN_FRAMES and size > limit
+        return self._mapping >= _MIN_FRAMES and size > limit
 
     @property
     def is_empty(self) -> bool:

@@ -127,6 +127,17 @@ class SubmapChain:
         drifted = compose_covariance(before.T, self.local.pose_covariance(), motion.T, motion.covariance)
         return self._odometry.pose(stamp_ns, before.T @ motion.T, drifted)
 
+    def add_located_pose(self, stamp_ns: int, motion: FloatArray, covariance: FloatArray) -> PoseEstimate:
+        """Add the pose after a motion (4, 4) from the filter's pose, which a frame shows that maps nothing.
+
+        covariance: (6, 6) of the motion. Returns it as T_odom_rig.
+        """
+        before = self.local.filter_pose(self.stamp_ns)
+        T, own = before.T @ motion, compose_covariance(before.T, before.covariance, motion, covariance)
+        self._builder.add_located_pose(PoseEstimate(stamp_ns, T, own))
+        drifted = compose_covariance(before.T, self.local.pose_covariance(), motion, covariance)
+        return self._odometry.pose(stamp_ns, T, drifted)
+
     def is_complete(self, shared: int) -> bool:
         """True if the submap ends with this frame, in which the next one would share so many landmarks with it."""
         return not self.is_held_open and self._builder.is_complete(self.local, self._config.submap, shared)

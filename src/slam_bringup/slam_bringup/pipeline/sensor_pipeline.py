@@ -236,7 +236,12 @@ def rig_pipelines(
 def for_camera(config: SystemConfig, camera: AgentSensors) -> SystemConfig:
     """The configuration for one of several cameras: the mode that its images are enough for."""
     mode = mode_of_camera(config.feature_extractor.mode, camera.topics)
-    return replace(config, feature_extractor=replace(config.feature_extractor, mode=mode))
+    return replace(config, feature_extractor=of_several(replace(config.feature_extractor, mode=mode)))
+
+
+def of_several(config: FrontendConfig) -> FrontendConfig:
+    """The front end of one of several cameras: each of its frames maps, as others may map at the same moment."""
+    return replace(config, features=replace(config.features, mapping_interval=0.0))
 
 
 def mode_of_camera(mode: str, roles: Collection[str]) -> str:

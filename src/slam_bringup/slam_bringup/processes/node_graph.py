@@ -15,7 +15,7 @@ from slam_bags.reading.sensor_topics import is_rectified, join, nodes_name
 from slam_bringup.pipeline.configuration import SystemConfig, awaited_streams
 from slam_bringup.pipeline.node_table import NODES, RESULT_TOPICS, node_named
 from slam_bringup.pipeline.overrides import Overrides, is_parameter_of
-from slam_bringup.pipeline.sensor_pipeline import for_camera, mode_of_camera, with_masks
+from slam_bringup.pipeline.sensor_pipeline import for_camera, mode_of_camera, of_several, with_masks
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand
 from slam_bringup.processes.start_map import StartMap
@@ -110,6 +110,7 @@ def live_nodes(
             specs.append(_spec("ndt_odometry", config.ndt_odometry, agent, extra, **frames))
         for place, own_mode in modes.items():
             front_end = replace(config.feature_extractor, mode=own_mode)
+            front_end = of_several(front_end) if several else front_end
             specs.append(_spec("feature_extractor", front_end, place, extra))
         wait_for = awaited_streams(config.ekf_slam, (known_roles or {}).get(agent, ()))
         own = base | {"agent": agent, "wait_for": wait_for, "cameras": tuple(several)}

@@ -22,20 +22,14 @@ from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.stereo.pixel_noise import PixelNoise, PixelNoiseConfig
 from stereo_frontend.surf.surf_device import SurfDevice
-from stereo_frontend.tracking.tracked_features import begun, followed
+from stereo_frontend.tracking.mapping_pace import MappingPace
+from stereo_frontend.tracking.tracked_features import PREDICTED_SIGMA, begun, followed, pose_only
 from stereo_frontend.tracking.tracker import Tracker
 
 CLIP = 0.005
 """Share of pixels beyond the black and the white point each."""
 GAMMA = 0.5
 """Exponent after normalisation: lifts what is far and dark."""
-_PREDICTED_SIGMA = 0.25
-"""Standard deviation, as a share of depth, of a predicted depth in place of one that the image lacks.
-
-It says next to nothing, so that such a track measures a direction alone. Without these, a track on an edge of depth or
-beside missing pixels, nearly half of all with a head-mounted depth camera, comes and goes from frame to frame.
-"""
-
 TOF_LONGEST_STEP_S = 0.15
 """Time between images beyond which nothing is followed: half of a stereo camera's. At 5 Hz a head-mounted depth camera
 loses so many tracks in a turn that frames stay without a pose.
@@ -63,13 +57,14 @@ class TofFeatures:
         features: FeatureConfig,
         noise: PixelNoiseConfig,
         tracker: Tracker | None,
+        pace: MappingPace,
         device: SurfDevice | None = None,
     ) -> None:
         self.config = config
         names = ("amplitude", "intensity", "range")
         self._extractors = {name: FeatureExtractor(features, device=device) for name in names}
         self._noise = PixelNoise(noise)
-        self._tracker = tracker
+        self._tracker, self._pace = tracker, pace
         self.used: tuple[str, ...] = ()
         """Names of the images that the newest features come from."""
 
@@ -92,20 +87,23 @@ class TofFeatures:
         return self._extractors[name](picture, image.mask, lambda uv: has_depth(image, uv))
 
     def _tracked(self, tracker: Tracker, image: DepthImage, name: str, picture: ByteArray) -> list[MeasuredKeypoints]:
-        """Tracks in the picture of that name, and new keypoints where they are few.
+        """Tracks in the picture of that name, and in a frame that maps new keypoints where they are few.
 
         Of tracks without a measured depth the direction counts, with the depth that the motion predicts.
         """
-        parts = []
+        parts, sigma = [], self._noise.sigma
         tracks = tracker.follow(picture, image.camera, image.stamp_ns, image.mask)
+        if tracks is not None and self._pace.is_pose_only(tracker, tracks, image.stamp_ns, image.camera):
+            return [pose_only(tracks, sigma)]
         if tracks is not None:
-            estimate = _depth_at(image, tracks.keypoints).completed(tracks.depth, _PREDICTED_SIGMA)
-            parts.append(followed(tracker, tracks, estimate, image.camera, self._noise.sigma))
+            estimate = _depth_at(image, tracks.keypoints).completed(tracks.depth, PREDICTED_SIGMA)
+            parts.append(followed(tracker, tracks, estimate, image.camera, sigma))
         number = parts[0].number_with_depth if parts else 0
         if tracker.needs_key_frame(number):
             keypoints = self._extractors[name](picture, image.mask)
             estimate = _depth_at(image, keypoints)
-            parts.append(begun(tracker, number, picture, keypoints, estimate, image.camera, self._noise.sigma))
+            parts.append(begun(tracker, number, picture, keypoints, estimate, image.camera, sigma))
+        self._pace.mapped(image.stamp_ns, parts)
         return parts
 
     @property

@@ -65,6 +65,14 @@ class FeatureConfig(Config):
         "where SURF is computed: cpu; gpu, the first one that OpenCL knows; auto, the same if there is one; or a part "
         "of the name of any OpenCL device (needs pyopencl)",
     )
+    mapping_interval: float = parameter(
+        0.1,
+        "time within which a frame whose features were all followed tells the pose alone: nothing is detected in it, "
+        "and no depth is measured; 0: every frame maps",
+        unit="s",
+        minimum=0.0,
+        maximum=1.0,
+    )
     max_tracks: int = parameter(150, "most features followed at a time", minimum=20, maximum=2000)
     surf: SurfConfig = group(SurfConfig)
 

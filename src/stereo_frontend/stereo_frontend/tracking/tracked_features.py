@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from slam_core.camera import Camera
-from slam_core.types import ByteArray, Float32Array
+from slam_core.types import ByteArray, FeatureSource, Float32Array
 from stereo_frontend.assembly import DepthEstimate, MeasuredKeypoints
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.tracking.tracker import Followed, Tracker
@@ -22,6 +22,12 @@ submaps are joined: landmarks as sure as the patch contradict each other (two_ro
 """
 
 
+PREDICTED_SIGMA = 0.25
+"""Standard deviation, as a share of depth, of a predicted depth in place of a measured one.
+
+It says next to nothing, so that such a track measures a direction alone.
+"""
+
 Noise = Callable[[Float32Array], Float32Array]
 """Standard deviations (n,) px of keypoints by their size (n,) px."""
 
@@ -32,6 +38,14 @@ def followed(
     """Features of the ``tracks`` (n), which have the depths of ``estimate`` (n); the tracker learns these."""
     tracker.measured(tracks, estimate.depth, camera)
     sigma = np.hypot(tracks.sigma_uv, _SHARE * noise(tracks.keypoints.size)[:, None])
+    return MeasuredKeypoints(tracks.keypoints, estimate, sigma.astype(np.float32), tracks.ids)
+
+
+def pose_only(tracks: Followed, noise: Noise) -> MeasuredKeypoints:
+    """Features of the ``tracks`` (n) of a frame in which no depth is measured: directions, with predicted depths."""
+    n, sigma = len(tracks.ids), np.hypot(tracks.sigma_uv, _SHARE * noise(tracks.keypoints.size)[:, None])
+    source = np.full(n, FeatureSource.PREDICTED, np.uint8)
+    estimate = DepthEstimate(tracks.depth, PREDICTED_SIGMA * tracks.depth, source)
     return MeasuredKeypoints(tracks.keypoints, estimate, sigma.astype(np.float32), tracks.ids)
 
 
