@@ -10,6 +10,7 @@ from dense_mapping.dense_stage import cameras_of
 from ekf_slam_node.config import ExternalOdometryConfig
 from slam_bags.reading.readings import AgentSensors
 from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.sensor_pipeline import for_camera
 from slam_bringup.processes.node_graph import live_nodes, plan_nodes, viewer_nodes
 from slam_bringup.processes.start_map import StartMap
 from slam_core.frame_tree import FrameTree
@@ -162,3 +163,14 @@ def test_the_dense_model_hears_the_cameras_that_each_agent_has() -> None:
     }  # fmt: skip
     assert heard(of_cameras("a", **both) | {"c": sensors("c")}) == {"a": ["a/back", "a/front"], "c": ["c"]}
     assert heard({"": sensors()}) == {"": [""]}
+
+
+def test_every_frame_of_one_of_several_cameras_maps() -> None:
+    """One camera's frame may map at the moment at which another's would tell the pose alone."""
+    config, pair = choose(load_system_config(None), "stereo", "sjsam", "none"), {"left": "a", "right": "b"}
+    for cameras, expected in (({}, {None}), ({"": {"front": pair, "back": pair}}, {0.0})):
+        specs = live_nodes(config, [""], odometry=False, cameras=cameras)
+        found = [spec.parameters for spec in specs if spec.executable == "feature_extractor"]
+        assert {parameters.get("features.mapping_interval") for parameters in found} == expected
+    rig = replace(sensors(), camera="front")
+    assert for_camera(config, rig).feature_extractor.features.mapping_interval == 0.0
