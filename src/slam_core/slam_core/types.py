@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -60,18 +60,50 @@ class Mask:
     pixels: ByteArray
 
 
+MakeImage = Callable[[], ByteArray]
+"""Makes an image once it is wanted, uint8 (height, width)."""
+
+
+class ImageOnDemand:
+    """A field of a dataclass that is given an image or a :data:`MakeImage`, and read as the image.
+
+    That is made once, when it is first read; ``dataclasses.replace`` reads every field that it is not given.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> ImageOnDemand: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> ByteArray: ...
+
+    def __get__(self, instance: object | None, owner: type) -> ImageOnDemand | ByteArray:
+        if instance is None:
+            raise AttributeError(f"{self._name} has no default")
+        image: ByteArray | MakeImage = vars(instance)[self._name]
+        if not callable(image):
+            return image
+        made = vars(instance)[self._name] = image()
+        return made
+
+    def __set__(self, instance: object, image: ByteArray | MakeImage) -> None:
+        vars(instance)[self._name] = image
+
+
 @dataclass(frozen=True, eq=False)
 class StereoImages:
     """A rectified pair: ``left`` and ``right`` uint8, shape (height, width), of ``stereo``, left in ``frame_id``.
 
-    ``colour`` makes the left image in colour: few frames are shown, all are searched for features. ``mask``: see
-    :class:`Mask`, of the left image.
+    ``right`` may be given as what makes it: not every frame needs it. So is ``colour``, the left image in colour: few
+    frames are shown, all are searched for features. ``mask``: see :class:`Mask`, of the left image.
     """
 
     stamp_ns: int
     left: ByteArray
-    right: ByteArray
-    stereo: StereoCamera
+    right: ImageOnDemand = ImageOnDemand()
+    stereo: StereoCamera  # type: ignore[misc]  # the field above has none
     frame_id: str = "stereo_left_optical_frame"
     colour: MakeColour = no_colour
     mask: ByteArray | None = None

@@ -69,6 +69,27 @@ def test_colours_lie_on_the_rectified_left_image(rng):
         np.testing.assert_array_equal(pair.colour()[..., channel], pair.left)
 
 
+def test_a_right_image_is_rectified_once_and_only_if_asked_for(rng, monkeypatch):
+    left, right = (CameraInfo(raw_camera("plumb_bob"), P=P) for P in (P_LEFT, P_RIGHT))
+    images, made = rng.integers(0, 256, (2, 240, 320), dtype=np.uint8), []
+    grey = FixedPointMap.grey
+    monkeypatch.setattr(FixedPointMap, "grey", lambda *a: made.append(a) or grey(*a))
+    pair = StereoRectifier(left, right)(7, *images, frame_id="eye")
+    assert len(made) == 1
+    assert pair.frame_id == "eye"
+    np.testing.assert_array_equal(pair.right, Rectifier(right, left.rectified)(images[1]))
+    made.clear()
+    assert pair.right is pair.right
+    assert not made
+
+
+def test_a_wrong_right_image_is_refused_before_it_is_asked_for():
+    left, right = (CameraInfo(raw_camera("plumb_bob"), P=P) for P in (P_LEFT, P_RIGHT))
+    good, small = np.zeros((240, 320), np.uint8), np.zeros((120, 320), np.uint8)
+    with pytest.raises(ValueError, match="its camera info says"):
+        StereoRectifier(left, right)(7, good, small)
+
+
 def spot(pixel: np.ndarray) -> np.ndarray:
     u, v = np.meshgrid(np.arange(320), np.arange(240))
     return (250 * np.exp(-((u - pixel[0]) ** 2 + (v - pixel[1]) ** 2) / 18.0)).astype(np.uint8)

@@ -10,6 +10,7 @@ After it, both images have one camera model without distortion, corresponding po
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ import numpy.typing as npt
 from slam_core.camera import Camera, CameraInfo, StereoCamera
 from slam_core.geometry import FloatArray
 from slam_core.runtime.in_place import in_place
-from slam_core.types import ByteArray, Float32Array, MakeColour, StereoImages, no_colour
+from slam_core.types import ByteArray, Float32Array, MakeColour, MakeImage, StereoImages, no_colour
 
 _OUTSIDE = -10.0
 _MINIMUM_BASELINE = 1e-4
@@ -73,9 +74,16 @@ class Rectifier:
         ValueError
             If the image is not uint8 grey or not of the size of the camera info.
         """
+        return self.when_asked(image)()
+
+    def when_asked(self, image: ByteArray) -> MakeImage:
+        """Makes the rectified image; the raw one is checked now, as by a call."""
         if image.ndim != 2:
             raise ValueError(f"a camera image must be grey (height, width), got {image.shape}")
         _check_image(image, self.source)
+        return partial(self._rectified, image)
+
+    def _rectified(self, image: ByteArray) -> ByteArray:
         # Not the image itself: a message's is read-only, for which every kernel would be compiled once more.
         return image.copy() if self._map is None else self._map.grey(image)
 
@@ -176,15 +184,31 @@ class StereoRectifier:
         self._right = Rectifier(right, self.stereo.camera)
 
     def __call__(
-        self, stamp_ns: int, left: ByteArray, right: ByteArray, colour: MakeColour = no_colour
+        self,
+        stamp_ns: int,
+        left: ByteArray,
+        right: ByteArray,
+        colour: MakeColour = no_colour,
+        frame_id: str = StereoImages.frame_id,
     ) -> StereoImages:
-        """Rectify one pair of raw images, uint8 (height, width) each, of one stamp; ``colour``: the left one's."""
+        """Rectify one pair of raw images, uint8 (height, width) each, of one stamp; the right one when it is asked for.
+
+        ``colour``: the left one's; ``frame_id``: that of the left camera.
+
+        Raises
+        ------
+        ValueError
+            As of :class:`Rectifier`, for either image, right away.
+        """
 
         def rectified_colour() -> ByteArray | None:
             raw = colour()
             return None if raw is None else self._left.colour(raw)
 
-        return StereoImages(stamp_ns, self._left(left), self._right(right), self.stereo, colour=rectified_colour)
+        right_when_asked = self._right.when_asked(right)
+        return StereoImages(
+            stamp_ns, self._left(left), right_when_asked, self.stereo, frame_id=frame_id, colour=rectified_colour
+        )
 
 
 def rectification_map(info: CameraInfo, target: Camera) -> FloatArray:
