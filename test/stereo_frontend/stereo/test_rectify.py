@@ -83,6 +83,20 @@ def test_a_right_image_is_rectified_once_and_only_if_asked_for(rng, monkeypatch)
     assert not made
 
 
+def test_each_calibration_has_a_map_of_its_own_that_is_made_once():
+    raw, turned = raw_camera("plumb_bob"), so3_exp(np.array([0.02, -0.01, 0.03]))
+    infos = [
+        CameraInfo(raw, P=P_LEFT),
+        CameraInfo(raw, turned, P_LEFT),
+        CameraInfo(raw_camera("equidistant"), P=P_LEFT),
+    ]
+    target = infos[0].rectified
+    wider = Camera(400, 240, 200.0, 200.0, 200.0, 120.0)
+    maps = [FixedPointMap.between(info, target) for info in infos] + [FixedPointMap.between(infos[0], wider)]
+    assert len({mapped.offset.tobytes() for mapped in maps}) == 4
+    assert FixedPointMap.between(infos[0], wider) is maps[-1]
+
+
 def test_a_wrong_right_image_is_refused_before_it_is_asked_for():
     left, right = (CameraInfo(raw_camera("plumb_bob"), P=P) for P in (P_LEFT, P_RIGHT))
     good, small = np.zeros((240, 320), np.uint8), np.zeros((120, 320), np.uint8)

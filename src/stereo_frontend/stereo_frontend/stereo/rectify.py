@@ -10,7 +10,7 @@ After it, both images have one camera model without distortion, corresponding po
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
@@ -23,6 +23,8 @@ from slam_core.types import ByteArray, Float32Array, MakeColour, MakeImage, Ster
 
 _OUTSIDE = -10.0
 _MINIMUM_BASELINE = 1e-4
+_STRIP = 32
+"""Rows whose rays are computed together: what they take fits the cache, which halves the time."""
 
 
 def stereo_camera_from_infos(left: CameraInfo, right: CameraInfo) -> StereoCamera:
@@ -108,9 +110,8 @@ class FixedPointMap:
 
     @classmethod
     def between(cls, info: CameraInfo, target: Camera) -> FixedPointMap:
-        """Map from the raw images of ``info`` to those of ``target``."""
-        pixels = np.nan_to_num(rectification_map(info, target), nan=_OUTSIDE).astype(np.float32)
-        return cls.of(pixels, info.camera.width, info.camera.height)
+        """Map from the raw images of ``info`` to those of ``target``; one of the last two is not made again."""
+        return _map_between(info.camera, tuple(info.R.ravel().tolist()), target)
 
     @classmethod
     def of(cls, pixels: Float32Array, width: int, height: int) -> FixedPointMap:
@@ -142,6 +143,14 @@ class FixedPointMap:
         """A picture in colour, bilinear."""
         mapped = cv2.remap(image, self.corner, self.fraction, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         return np.asarray(mapped, np.uint8)
+
+
+@lru_cache(2)
+def _map_between(camera: Camera, rotation: tuple[float, ...], target: Camera) -> FixedPointMap:
+    """The maps of a pair: a recording is looked at, mapped and made a dense model of with the same ones."""
+    info = CameraInfo(camera, np.reshape(rotation, (3, 3)))
+    pixels = np.nan_to_num(rectification_map(info, target), nan=_OUTSIDE).astype(np.float32)
+    return FixedPointMap.of(pixels, camera.width, camera.height)
 
 
 @in_place()
@@ -216,9 +225,13 @@ def rectification_map(info: CameraInfo, target: Camera) -> FloatArray:
 
     Shape (height, width, 2), NaN behind the camera.
     """
-    u, v = np.meshgrid(np.arange(target.width, dtype=np.float64), np.arange(target.height, dtype=np.float64))
-    rays = target.unproject(np.column_stack([u.ravel(), v.ravel()]), np.ones(u.size)) @ info.R
-    return info.camera.project(rays).reshape(target.height, target.width, 2)
+    out = np.empty((target.height, target.width, 2))
+    columns, rows = np.arange(target.width, dtype=np.float64), np.arange(target.height, dtype=np.float64)
+    for top in range(0, target.height, _STRIP):
+        u, v = np.meshgrid(columns, rows[top : top + _STRIP])
+        rays = target.unproject(np.column_stack([u.ravel(), v.ravel()]), np.ones(u.size)) @ info.R
+        out[top : top + _STRIP] = info.camera.project(rays).reshape(*u.shape, 2)
+    return out
 
 
 def _check_image(image: ByteArray, camera: Camera) -> None:
