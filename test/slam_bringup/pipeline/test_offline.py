@@ -45,7 +45,7 @@ def doubled(items):
 
 def stage(items):
     """A stage that hands over three items at a time."""
-    return prefetch(items, lambda k: k % 3 == 0)
+    return prefetch(items, lambda k: k % 3 == 0, 8)
 
 
 def squared(items):

@@ -73,3 +73,29 @@ def test_libraries_work_as_before_after_their_code_was_left_to_the_system() -> N
     loaded, left, is_same = subprocess.check_output([sys.executable, "-c", LIBRARIES], text=True).split()
     assert float(left) < 0.6 * float(loaded)
     assert is_same == "True"
+
+
+HEAP = """
+import re
+import numpy as np
+from slam_core.runtime.memory import share_one_heap, trim_heap
+
+def own_mib():
+    return int(re.search(r"RssAnon:\\s+(\\d+)", open("/proc/self/status").read())[1]) / 1024
+
+share_one_heap()
+at_first = own_mib()
+images, last = [np.ones(100_000) for _ in range(60)], np.ones(100_000)
+del images
+free = own_mib()
+trim_heap()
+print(free - at_first, own_mib() - at_first, last.sum())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the C library of Linux")
+def test_what_is_free_below_something_in_use_goes_back_to_the_system() -> None:
+    free, trimmed, total = map(float, subprocess.check_output([sys.executable, "-c", HEAP], text=True).split())
+    assert free > 40.0
+    assert trimmed < 10.0
+    assert total == 100_000.0

@@ -24,7 +24,7 @@ from slam_bags.reading.readings import (
 )
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.prefetch import prefetch
+from slam_bringup.pipeline.prefetch import IMAGES_AHEAD, prefetch
 from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
@@ -78,7 +78,7 @@ def _readings(
     """Readings of the bag: where it has been read before, its key frames alone, with what accelerometers read then."""
     times = bag.times
     if not times.is_whole or any(camera.needs_colours for camera in cameras.values()):
-        with closing(prefetch(bag.readings(colours=True), _is_an_image)) as readings:
+        with closing(prefetch(bag.readings(colours=True), _is_an_image, IMAGES_AHEAD)) as readings:
             for reading in readings:
                 yield reading
                 if not isinstance(reading, ColourReading):
@@ -88,7 +88,7 @@ def _readings(
         camera.add_forces(times)
     wanted = {agent: camera.key_stamps(times) for agent, camera in cameras.items()}
     expected, passed = max(1, sum(map(len, wanted.values()))), 0
-    with closing(prefetch(bag.images_at(wanted), _is_an_image)) as readings:
+    with closing(prefetch(bag.images_at(wanted), _is_an_image, IMAGES_AHEAD)) as readings:
         for k, reading in enumerate(readings, 1):
             yield reading
             now = min(times.count, k * times.count // expected)

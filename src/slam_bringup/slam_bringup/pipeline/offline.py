@@ -10,6 +10,7 @@ does not depend on that.
 
 from __future__ import annotations
 
+import gc
 import logging
 import time
 from collections.abc import Callable, Generator
@@ -24,10 +25,11 @@ from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.mapper import Mapper
-from slam_bringup.pipeline.prefetch import prefetch
+from slam_bringup.pipeline.prefetch import IMAGES_AHEAD, prefetch
 from slam_bringup.pipeline.run_record import describe_error, run_result
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline, rig_pipelines
 from slam_bringup.pipeline.stage_times import StageTimes
+from slam_core.runtime.memory import leave_libraries, trim_heap
 from slam_core.types import ImuSample, OdometryReading, PositionReading, PressureReading
 from slam_viewer.results import RunResult
 
@@ -35,6 +37,8 @@ _LOG = logging.getLogger(__name__)
 _BESIDE_IMAGES = (
     ImuReading | ImuSample | PoseReading | OdometryReading | FixReading | PositionReading | AirReading | PressureReading
 )
+_FEATURES_AHEAD = 8
+"""Frames with features that may wait for the filter, which takes longer where a submap ends."""
 
 
 def run_bag(
@@ -82,6 +86,8 @@ def run_bag(
     times = StageTimes()
     start = time.perf_counter()
     with SensorBag(path, names) as bag:
+        leave_libraries()  # which modules were loaded with; kernels take as much
+        trim_heap()
         pipelines = _pipelines(bag, config, odometry != "none", times)
         mapping = Mapper(config, bag.sensors, times, session or MapSession(config.sjsam))
         failure = _map(mapping, _measured(bag, pipelines, on_reading, stopped))
@@ -93,7 +99,9 @@ def run_bag(
         )
         _LOG.info("mapped %d submaps in %.1f s; the dense model is next", record.submaps, record.wall_s)
         session = mapping.session
-        del pipelines, mapping  # with their images and filters
+        del pipelines, mapping  # with their images and filters, 60 MB in cycles
+        gc.collect()
+        trim_heap()
         with times.measure("dense model"):
             result = run_result(
                 bag,
@@ -120,12 +128,13 @@ def _map(mapping: Mapper, items: Generator[AgentItem, None, None]) -> str:
     """Map all items; the reason is returned if an error ended the run early, and raised before the first frame."""
     failure = ""
     try:
-        for item in prefetch(items, _is_of_an_image):
+        for item in prefetch(items, _is_of_an_image, _FEATURES_AHEAD):
             mapping.process(item)
     except Exception as error:
         if not mapping.has_frames:
             raise
         failure = describe_error(error, "the run ended early")
+    trim_heap()
     mapping.finish()
     return failure
 
@@ -134,7 +143,7 @@ def _measured(
     bag: SensorBag, pipelines: dict[str, SensorPipeline], on_reading: Callable[[], None], stopped: Callable[[], bool]
 ) -> Generator[AgentItem, None, None]:
     """Reading, finding features and measuring their depth, each on a thread of its own."""
-    with closing(prefetch(_extracted(bag, pipelines, on_reading, stopped), _is_of_an_image)) as items:
+    with closing(prefetch(_extracted(bag, pipelines, on_reading, stopped), _is_of_an_image, IMAGES_AHEAD)) as items:
         for item in items:
             yield pipelines[item.agent].measure(item)
 
@@ -142,7 +151,7 @@ def _measured(
 def _extracted(
     bag: SensorBag, pipelines: dict[str, SensorPipeline], on_reading: Callable[[], None], stopped: Callable[[], bool]
 ) -> Generator[AgentItem, None, None]:
-    with closing(prefetch(bag.readings(), _is_of_an_image)) as readings:
+    with closing(prefetch(bag.readings(), _is_of_an_image, IMAGES_AHEAD)) as readings:
         for reading in readings:
             yield from pipelines[reading.agent].add(reading)
             on_reading()

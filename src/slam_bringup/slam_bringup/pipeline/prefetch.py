@@ -11,16 +11,16 @@ from typing import TypeAlias, TypeVar
 
 T = TypeVar("T")
 Batches: TypeAlias = queue.Queue[tuple[list[T] | None, BaseException | None]]
-_AHEAD = 8
-"""Batches that may wait between two stages."""
+IMAGES_AHEAD = 2
+"""Batches with images that may wait between two stages: those of a depth camera take 2 to 5 MB."""
 
 
-def prefetch(items: Generator[T, None, None], ends_batch: Callable[[T], bool]) -> Generator[T, None, None]:
-    """Items of an iterator, made by another thread a few batches ahead of their use.
+def prefetch(items: Generator[T, None, None], ends_batch: Callable[[T], bool], ahead: int) -> Generator[T, None, None]:
+    """Items of an iterator, made by another thread up to ``ahead`` batches before their use.
 
     Handing over wakes threads: IMU samples, ten to a frame, go together with the image that they come before.
     """
-    made: Batches[T] = queue.Queue(_AHEAD)
+    made: Batches[T] = queue.Queue(ahead)
     stopped = threading.Event()
     thread = threading.Thread(target=_fill, args=(made, items, ends_batch, stopped), name="images", daemon=True)
     thread.start()

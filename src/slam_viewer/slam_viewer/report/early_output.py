@@ -11,6 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from slam_core.runtime.memory import trim_heap
 from slam_viewer.report.mapped_files import write_mapped
 from slam_viewer.results import RunResult
 
@@ -45,6 +46,7 @@ class EarlyOutput:
         from slam_viewer.report.result_bag import write_result_bag
 
         messages = self._mapped.result() if self._mapped is not None else None
+        trim_heap()  # of what the dense model took
         charts = self._pool.submit(_draw, result) if pictures else None
         write_result_bag(self._out / "result.mcap", result, messages)
         made = charts.result() if charts is not None else None
@@ -58,6 +60,7 @@ class EarlyOutput:
         from slam_viewer.report.result_bag import agents_messages
 
         write_mapped(self._out, result, self._save_map)
+        trim_heap()  # saved, a map that is not to go on lets go what it was solved with
         return agents_messages(result)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 from dense_mapping.plans.floor_plan import FloorPlan
 from dense_mapping.plans.plan_io import plan_names, write_plan
 from dense_mapping.reconstruction.surface_io import write_glb, write_mesh, write_points
-from slam_core.runtime.memory import leave_libraries
+from slam_core.runtime.memory import leave_libraries, trim_heap
 from slam_core.runtime.process_life import command_line, seconds_since_start
 from slam_core.storage.files import atomic_text
 from slam_core.version import VERSION
@@ -47,10 +47,11 @@ def write_results(
     if not is_mapped:
         write_mapped(out, result, save_map)
     (out / "summary.json").unlink(missing_ok=True)
+    trim_heap()
+    leave_libraries()  # what has drawn; the GLB takes 70 MB for a moment
     write_points(out / "map.ply", result.dense)
     write_mesh(out / "mesh.ply", result.dense)
     write_glb(out / "mesh.glb", result.dense)
-    leave_libraries()  # it takes 70 MB for a moment, as drawing does
     _write_plans(out, result.floor_plans)
     if (out / "result.mcap").is_file():
         write_layout(out / "foxglove_layout.json", out / "result.mcap")
