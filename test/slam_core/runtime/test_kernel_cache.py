@@ -20,15 +20,17 @@ def twice(values):
 
 @njit(cache=True)
 def total(values):
-    return sum(twice(values))
+    return sum(twice(values)) + np.zeros(3).sum()
 """
 SCRIPT = """
+import sys
 from kernels import total, twice
 from numba import njit
 print(sum(twice([1.0, 2.0])), total([1.0, 2.0]))
 libraries = [kernel.overloads[kernel.signatures[0]].library for kernel in (twice, total)]
 print(sum(kernel.stats.cache_hits[s] for kernel in (twice, total) for s in kernel.stats.cache_hits))
 print(sum(library._shared_module is None or not list(library._shared_module.functions) for library in libraries))
+print("numba.np.arrayobj" in sys.modules)
 caller = njit(lambda values: total(values) + 1.0)
 print(caller([1.0, 2.0]))
 """
@@ -37,6 +39,6 @@ print(caller([1.0, 2.0]))
 @pytest.mark.skipif(sys.platform != "linux", reason="object files of Linux")
 def test_kernels_from_the_cache_hold_no_llvm_code_and_can_be_called_by_new_ones(tmp_path: Path) -> None:
     (tmp_path / "kernels.py").write_text(KERNELS)
-    for hits, bare in ((0, 0), (2, 2)):
+    for hits, bare, has_numbas_modules in ((0, 0, True), (2, 2, False)):
         lines = subprocess.check_output([sys.executable, "-c", SCRIPT], text=True, cwd=tmp_path).splitlines()
-        assert lines == ["6.0 6.0", str(hits), str(bare), "7.0"]
+        assert lines == ["6.0 6.0", str(hits), str(bare), str(has_numbas_modules), "7.0"]
