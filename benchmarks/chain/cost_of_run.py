@@ -8,6 +8,7 @@ A stage's time is that of its own thread and of what it hands to helping threads
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 import threading
@@ -91,7 +92,14 @@ class StageCpu:
         return self._submit(pool, timed)
 
 
+def peak_mib() -> float:
+    """Peak memory of this program alone: what ``wait4`` tells begins with that of the process that started it."""
+    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return float(lines["VmHWM"].split()[0]) / 1024.0
+
+
 def main() -> None:
+    gc.disable()  # as slam does while modules are loaded
     target, *arguments = sys.argv[1:]
     cpu = StageCpu()
     StageTimes.measure = lambda times, stage: cpu.measure(times, stage)  # type: ignore[method-assign,assignment]
@@ -102,7 +110,9 @@ def main() -> None:
         MapSession._add = lambda *a: cpu.join(add, *a)  # type: ignore[method-assign]
     slam(["run", *arguments], standalone_mode=False)
     mapped = time.process_time() if cpu.mapped is None else cpu.mapped
-    report = {"stages": cpu.seconds, "mapping": mapped - (cpu.began or 0.0), "before": cpu.began}
+    report = {
+        "stages": cpu.seconds, "mapping": mapped - (cpu.began or 0.0), "before": cpu.began, "peak_mib": peak_mib(),
+    }  # fmt: skip
     Path(target).write_text(json.dumps(report))
 
 
