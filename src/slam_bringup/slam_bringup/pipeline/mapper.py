@@ -36,8 +36,8 @@ from slam_core.types import (
     Submap,
 )
 
-_LOADED = 1, 4
-"""Frames of an agent after which what images, and what the filter needs, is loaded."""
+_LOADED = 4
+"""Frames of an agent after which the kernels of images and filter are loaded."""
 
 
 class Mapper:
@@ -181,7 +181,7 @@ class Mapper:
     def _take_results(self, agent: str) -> None:
         for frame in self._times.each("ekf", self._filters[agent].ready()):
             self._diaries[agent].add(frame)
-            if len(self._diaries[agent].poses) in _LOADED:
+            if len(self._diaries[agent].poses) == _LOADED:
                 leave_libraries()
             self._hand_over(frame.estimate.submaps)
 

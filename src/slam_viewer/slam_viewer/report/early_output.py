@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from slam_core.runtime.memory import trim_heap
+from slam_core.runtime.memory import leave_libraries, trim_heap
 from slam_viewer.report.mapped_files import write_mapped
 from slam_viewer.results import RunResult
 
@@ -47,6 +47,7 @@ class EarlyOutput:
 
         messages = self._mapped.result() if self._mapped is not None else None
         trim_heap()  # of what the dense model took
+        leave_libraries()  # those that draw take 50 MB
         charts = self._pool.submit(_draw, result) if pictures else None
         write_result_bag(self._out / "result.mcap", result, messages)
         made = charts.result() if charts is not None else None
