@@ -79,8 +79,7 @@ class StereoStage:
                 left, right = self.infos
                 right = right if self._error is None else corrected_right(right, self._error)[0]
                 self._rectifier = StereoRectifier(left, right)
-            images = self._rectifier(pair.stamp_ns, pair.left, pair.right, pair.colour)
-            yield replace(images, frame_id=pair.frame_id)
+            yield self._rectifier(pair.stamp_ns, pair.left, pair.right, pair.colour, pair.frame_id)
 
     def reset(self) -> None:
         """Forget what waits; the calibration stays."""
