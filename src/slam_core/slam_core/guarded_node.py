@@ -30,8 +30,9 @@ class GuardedNode(LifecycleNode):
         self.calls = 0
         """Callbacks called so far: as long as it grows there may be more to receive."""
         self.sleeps = False
-        """True while its thread waits in an executor: it has to be woken for what another thread hands over."""
+        """True while its thread waits for messages: it has to be woken for what another thread hands over."""
         self._paused = False
+        self._answering = 0
         super().__init__(name, **options)
         self.trigger_configure()
         self.trigger_activate()
@@ -84,12 +85,15 @@ class GuardedNode(LifecycleNode):
 
         async def answer(request: Any, response: Any) -> Any:
             self.calls += 1
+            self._answering += 1
             try:
                 answered = callback(request, response)
                 return await answered if inspect.isawaitable(answered) else answered
             except Exception as error:
                 self._on_fault(f"service {srv_name}")
                 return _failed(srv_type.Response(), f"{type(error).__name__}: {error}")
+            finally:
+                self._answering -= 1
 
         options.setdefault("callback_group", ReentrantCallbackGroup())
         return super().create_service(srv_type, srv_name, answer, *rest, **options)
@@ -98,6 +102,21 @@ class GuardedNode(LifecycleNode):
     def has_work(self) -> bool:
         """True if something waits that :meth:`work` would do."""
         return False
+
+    @property
+    def received_subscriptions(self) -> list[Any]:
+        """The subscriptions whose messages :meth:`receive` takes; those of others are the executor's."""
+        return []
+
+    @property
+    def urgent_subscriptions(self) -> list[Any]:
+        """Received subscriptions that wake the node; messages of the others are taken with the next one that does."""
+        return self.received_subscriptions
+
+    @property
+    def needs_executor(self) -> bool:
+        """True if only an executor can go on: an answer awaits something, or the node asks services of others."""
+        return self._answering > 0 or any(True for _ in self.clients)
 
     def receive(self) -> None:
         """Take all messages that have come. Whoever spins the node calls it before each piece of work."""

@@ -27,6 +27,7 @@ import numpy as np
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -203,29 +204,80 @@ def spin(node: RunnableNode, executor: SingleThreadedExecutor, stopped: threadin
     All that has come is received before the next job is done, so that the node itself knows what waits and what to
     leave out, not the transport.
     """
-    served_s = 0.0
+    waiting, served_s = MessageWait(node) if isinstance(node, GuardedNode) else None, 0.0
     while rclpy.ok(context=executor.context) and not stopped.is_set():
-        if not isinstance(node, GuardedNode):
+        if waiting is None or not isinstance(node, GuardedNode):
             executor.spin_once(timeout_sec=_SIGNAL_PERIOD_S)
             continue
         if not node.has_work:
-            _wait(node, executor)
+            _wait(node, waiting, executor)
         elif time.monotonic() > served_s + _SERVICE_PERIOD_S:
-            _serve(node, executor)
+            _serve(node, waiting, executor)
             served_s = time.monotonic()
         node.receive()
         node.work()
 
 
-def _wait(node: GuardedNode, executor: SingleThreadedExecutor) -> None:
+class MessageWait:
+    """Waits for a node's messages in a quarter of an executor's time, and tells when the executor has to be asked.
+
+    The executor collects what it waits for in Python each time, twice for a message. The set of this class is made once
+    and again when the node's subscriptions, services or timers have changed, which only the node's own thread does.
+    """
+
+    def __init__(self, node: GuardedNode) -> None:
+        self._node = node
+        self._entities: list[Any] = []
+        self._additions: list[tuple[Callable[[Any], int], Any]] = []
+        self._others: set[int] = set()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until something comes; True if it is something else than messages that ``node.receive`` takes."""
+        node = self._node
+        entities = [*node.subscriptions, *node.guards, *node.timers, *node.services]
+        if entities != self._entities:
+            self._make_set()
+            self._entities = entities
+        self._set.clear_entities()
+        for add, handle in self._additions:
+            add(handle)
+        for subscription in node.urgent_subscriptions:
+            self._set.add_subscription(subscription.handle)
+        self._set.wait(int(1e9 * timeout_s))
+        ready = (p for kind in ("subscription", "timer", "service") for p in self._set.get_ready_entities(kind))
+        return not self._others.isdisjoint(ready)
+
+    def _make_set(self) -> None:
+        node, make = self._node, rclpy_implementation.WaitSet
+        received = node.received_subscriptions
+        subscriptions = [s for s in node.subscriptions if s not in received]
+        guards, timers, services = list(node.guards), list(node.timers), list(node.services)
+        number = len(subscriptions) + len(received)
+        self._set = make(number, len(guards), len(timers), 0, len(services), 0, node.context.handle)
+        others = (
+            *((self._set.add_subscription, entity.handle) for entity in subscriptions),
+            *((self._set.add_timer, entity.handle) for entity in timers),
+            *((self._set.add_service, entity.handle) for entity in services),
+        )
+        self._others = {handle.pointer for _, handle in others}
+        self._additions = [*others, *((self._set.add_guard_condition, guard.handle) for guard in guards)]
+
+
+def _wait(node: GuardedNode, waiting: MessageWait, executor: SingleThreadedExecutor) -> None:
     """Until something comes, from the network or from another thread."""
     node.sleeps = True
-    executor.spin_once(timeout_sec=0.0 if node.has_work else _SIGNAL_PERIOD_S)
+    timeout_s = 0.0 if node.has_work else _SIGNAL_PERIOD_S
+    if node.needs_executor:
+        executor.spin_once(timeout_sec=timeout_s)
+    elif waiting.wait(timeout_s):
+        executor.spin_once(timeout_sec=0.0)
     node.sleeps = False
 
 
-def _serve(node: GuardedNode, executor: SingleThreadedExecutor) -> None:
+def _serve(node: GuardedNode, waiting: MessageWait, executor: SingleThreadedExecutor) -> None:
     """Call back all that is ready: timers and services too, of which a node that has work to do hears only here."""
+    if not node.needs_executor and not waiting.wait(0.0):
+        return
     for _ in range(_SERVICE_CALLS):
         calls = node.calls
         executor.spin_once(timeout_sec=0.0)

@@ -119,7 +119,8 @@ def test_messages_without_end_do_not_keep_a_node_from_its_work(node: EarNode) ->
             if node.calls > 10_000:
                 raise RecursionError
 
-    ros._serve(node, Flood())
+    node.create_client(Trigger, "other")  # so that the executor alone is asked
+    ros._serve(node, ros.MessageWait(node), Flood())
     assert node.calls > 10
 
 
@@ -214,6 +215,10 @@ def test_a_node_reports_at_once_that_its_inputs_are_connected(node: EarNode, mon
         monkeypatch.setattr(node, "_unconnected", lambda topics=unconnected: topics)
         node._report_connections()
     assert reported == ["/frames", ""]
+    assert node._connection_timer.is_canceled()
+    monkeypatch.setattr(node, "_unconnected", lambda: ["/frames"])
+    node._tick()
+    assert not node._connection_timer.is_canceled()
 
 
 def test_what_has_come_belongs_to_an_input_that_ends_and_the_end_is_reported(

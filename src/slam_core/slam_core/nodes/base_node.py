@@ -90,7 +90,7 @@ class SlamNode(TransformNode, Generic[C]):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported_unconnected: list[str] | None = None
         self.create_timer(1.0, self._tick, clock=steady)
-        self.create_timer(_CONNECTION_PERIOD_S, self._report_connections, clock=steady)
+        self._connection_timer = self.create_timer(_CONNECTION_PERIOD_S, self._report_connections, clock=steady)
 
     # -- for the nodes -------------------------------------------------------------------------------------------------
 
@@ -344,6 +344,8 @@ class SlamNode(TransformNode, Generic[C]):
         if silence and not self._silence_text:
             self.get_logger().warning(silence)
         self._silence_text = silence
+        if self._unconnected():
+            self._connection_timer.reset()
         self.report_now()
 
     def _rivals(self) -> str:
@@ -356,10 +358,12 @@ class SlamNode(TransformNode, Generic[C]):
         return "; ".join(texts)
 
     def _report_connections(self) -> None:
-        """Whoever waits for the nodes learns at once that one is there, and when its inputs are connected."""
+        """Tell whoever waits for the nodes at once; when all inputs are connected, a look every second is enough."""
         if (unconnected := self._unconnected()) != self._reported_unconnected:
             self._reported_unconnected = unconnected
             self.report_now()
+        if not unconnected:
+            self._connection_timer.cancel()
 
     def _report_change(self) -> None:
         """A change of state is reported at once, with the stamp of the input that brought it."""

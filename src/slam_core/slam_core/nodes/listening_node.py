@@ -87,12 +87,26 @@ class ListeningNode(GuardedNode):
         """True if a job can be done, or a message of this process waits."""
         return len(self._inbox) > 0 or self._jobs.has_ready(frames=self._may_begin())
 
+    @property
+    def received_subscriptions(self) -> list[Any]:
+        """Subscriptions of the inputs that come from the network."""
+        return [entry.subscription for entry in self._inputs.values() if entry.subscription is not None]
+
+    @property
+    def urgent_subscriptions(self) -> list[Any]:
+        """Subscriptions of the inputs that cannot wait for the next frame."""
+        inputs = self._inputs.values()
+        return [entry.subscription for entry in inputs if entry.subscription is not None and not self._can_wait(entry)]
+
+    def _can_wait(self, entry: Input) -> bool:
+        """True if messages of an input are early enough when they are received with the next frame: calibrations."""
+        return entry.policy is StampPolicy.ANY
+
     def receive(self) -> None:
         """Take all messages that have come, so that the queue knows what waits and what to leave out."""
+        for subscription in self.received_subscriptions:
+            self._drain(subscription)
         self._empty_inbox()
-        for entry in self._inputs.values():
-            if entry.subscription is not None:
-                self._drain(entry.subscription)
 
     def _drain(self, subscription: Any) -> None:
         """Take messages past the executor, which for each of them would set up anew what it waits for, 0.3 ms."""
@@ -137,7 +151,7 @@ class ListeningNode(GuardedNode):
         """Publish a topic (full name) in this process too."""
         if self._exchange is not None:
             self._topics_out.append(topic)
-            self._exchange.advertise(topic, self._awaken)
+            self._exchange.advertise(topic, self._look_for_room)
 
     def _add_entry(self, topic: str, entry: Input) -> None:
         entry.best_effort = self.input_config.reliability == "best_effort"
@@ -170,6 +184,11 @@ class ListeningNode(GuardedNode):
         """Have the node's thread look for work, if it waits for messages; it looks itself before it does."""
         if self.sleeps:
             self._wake.trigger()
+
+    def _look_for_room(self) -> None:
+        """A listener has room for a frame: go on if one waits for that."""
+        if self._jobs.has_ready():
+            self._awaken()
 
     def _empty_inbox(self) -> None:
         while self._inbox:

@@ -15,6 +15,8 @@ from slam_core.config import C
 from slam_core.nodes.base_node import SlamNode
 from slam_core.nodes.input_config import OVERDUE_S
 from slam_core.nodes.job_queue import QueuedCall
+from slam_core.nodes.listening_node import Input
+from slam_core.nodes.stamp_guard import StampPolicy
 
 
 class StageNode(SlamNode[C]):
@@ -36,6 +38,11 @@ class StageNode(SlamNode[C]):
     def publish_ready(self) -> object:
         """Publish the results of all frames that need not wait."""
         raise NotImplementedError
+
+    def _can_wait(self, entry: Input) -> bool:
+        """Readings of an IMU, say, while no frame waits for one: each of them would wake the node."""
+        accompanies = entry.policy is StampPolicy.FOLLOWS and self.stage.oldest_waiting_ns is None
+        return accompanies or super()._can_wait(entry)
 
     def _look_for_overdue(self) -> None:
         waiting, now = self.stage.oldest_waiting_ns, time.monotonic()

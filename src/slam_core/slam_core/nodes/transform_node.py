@@ -29,11 +29,15 @@ class TransformNode(ListeningNode):
         self._listen_to_static_transforms()
         self._tf = self._advertise_tf()
 
-    def receive(self) -> None:
+    @property
+    def received_subscriptions(self) -> list[Any]:
         """Transforms first: what else has come needs them."""
-        for subscription in self._static_inputs:
-            self._drain(subscription)
-        super().receive()
+        return [*self._static_inputs, *super().received_subscriptions]
+
+    @property
+    def urgent_subscriptions(self) -> list[Any]:
+        """Transforms too."""
+        return [*self._static_inputs, *super().urgent_subscriptions]
 
     def lookup(self, target: str, source: str) -> FloatArray:
         """T_target_source (4, 4) from the static transforms; ValueError, so a counted rejection, if unknown."""
