@@ -22,7 +22,8 @@ from slam_core import ros  # noqa: E402
 from slam_core.config import Config, parameter  # noqa: E402
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC, header_message, stamp_ns, transform_message  # noqa: E402
 from slam_core.nodes.base_node import SlamNode  # noqa: E402
-from slam_core.nodes.exchange import Exchange  # noqa: E402
+from slam_core.nodes.exchange import Exchange, Listener  # noqa: E402
+from slam_core.nodes.job_queue import QueuedCall  # noqa: E402
 from slam_core.ros import sensor_qos  # noqa: E402
 
 START = 1_700_000_000 * 10**9
@@ -206,6 +207,23 @@ def test_a_frame_that_nobody_can_go_on_with_is_left_out_by_the_first_node(node: 
     assert not slow._jobs.skipped
     for relay in (first, slow):
         relay.destroy_node()
+
+
+def test_a_frame_awakens_a_listener_once_when_all_of_it_is_made(node: EarNode) -> None:
+    exchange, seen = Exchange(), []
+    with exchange.node([]):
+        relay = EarNode()
+    listener = Listener(seen.append, lambda: seen.append("awake"), None)
+    for topic in ("/depth", "/noise"):
+        relay.advertise(topic, "PointCloud2")
+        exchange.listen(topic, listener)
+    frame = node._ros_types.PointCloud2(header=header_message(node._ros_types, START, ""))
+    relay._jobs.add(QueuedCall("frames", lambda: [relay.publish(topic, frame) for topic in ("/depth", "/noise")]))
+    relay.work()
+    assert seen == [frame, frame, "awake"]
+    relay.publish("/depth", frame)
+    assert seen[3:] == [frame, "awake"]
+    relay.destroy_node()
 
 
 def test_a_node_reports_at_once_that_its_inputs_are_connected(node: EarNode, monkeypatch: pytest.MonkeyPatch) -> None:

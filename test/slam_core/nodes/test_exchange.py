@@ -16,7 +16,7 @@ from slam_core.messages import (
     points_message,
     stamp_ns,
 )
-from slam_core.nodes.exchange import Exchange, SharedTypes, as_ros
+from slam_core.nodes.exchange import Exchange, Listener, SharedTypes, as_ros
 from slam_core.types import PoseEstimate
 
 STAMP = 1_700_000_000_123_456_789
@@ -55,9 +55,10 @@ def test_only_listeners_of_a_topic_hear_it() -> None:
     exchange.advertise("/a", lambda: None)
     assert exchange.has_publisher("/a")
     assert not exchange.has_listeners("/a")
-    exchange.listen("/a", heard.append)
-    exchange.publish("/a", 1)
-    exchange.publish("/b", 2)
+    listener = Listener(heard.append, lambda: heard.append("awake"), None)
+    exchange.listen("/a", listener)
+    assert exchange.publish("/a", 1) == [listener.awaken]
+    assert exchange.publish("/b", 2) == []
     assert heard == [1]
 
 
@@ -65,10 +66,11 @@ def test_there_is_room_where_any_listener_would_begin_a_frame_at_once() -> None:
     exchange, full, told = Exchange(), {"a": False, "b": False}, []
     exchange.advertise("/depth", lambda: told.append("maker"))
     assert exchange.has_room(["/depth"], ahead=False)
-    exchange.listen("/depth", lambda _: None)
+    exchange.listen("/depth", Listener(told.append, lambda: None, None))
     assert exchange.has_room(["/depth"], ahead=False)
     for name in full:
-        exchange.listen("/depth", lambda _: None, lambda ahead, n=name: full[n] and not ahead)
+        is_full = lambda ahead, n=name: full[n] and not ahead  # noqa: E731
+        exchange.listen("/depth", Listener(told.append, lambda: None, is_full))
     for full["a"], full["b"], room in ((False, True, True), (True, False, True), (True, True, False)):
         assert exchange.has_room(["/depth", "/unheard"], ahead=False) == room
         assert exchange.has_room(["/depth", "/unheard"], ahead=True)

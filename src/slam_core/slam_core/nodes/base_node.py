@@ -162,7 +162,7 @@ class SlamNode(TransformNode, Generic[C]):
         if self._exchange is None:
             self._outputs[topic].publish(message)
             return
-        self._exchange.publish(self.resolve_topic_name(topic), message)
+        self._awaken_listeners(self._exchange.publish(self.resolve_topic_name(topic), message))
         if topic in self._latched or self._outputs[topic].get_subscription_count() > 0:
             self._outputs[topic].publish(as_ros(message))
 

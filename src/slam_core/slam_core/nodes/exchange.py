@@ -22,9 +22,13 @@ from slam_core.types import AnyArray
 
 
 class Listener(NamedTuple):
-    """Takes a topic's messages; ``is_full`` tells if another frame has to wait, None where they are no frames."""
+    """Takes a topic's messages; ``awaken`` has it look at them.
 
-    callback: Callable[[Message], None]
+    ``is_full`` tells if another frame has to wait, None where they are no frames.
+    """
+
+    take: Callable[[Message], None]
+    awaken: Callable[[], None]
     is_full: Callable[[bool], bool] | None
 
 
@@ -58,14 +62,12 @@ class Exchange:
         """True if a node of this process publishes the topic."""
         return topic in self._publishers
 
-    def listen(
-        self, topic: str, callback: Callable[[Message], None], is_full: Callable[[bool], bool] | None = None
-    ) -> None:
-        """Call back with every message of the topic, in the thread of its publisher.
+    def listen(self, topic: str, listener: Listener) -> None:
+        """Have a listener take every message of the topic, in the thread of its publisher.
 
         ``is_full``, of a topic of frames, says whether another one has to wait, given whether it is made ahead.
         """
-        self._listeners[topic].append(Listener(callback, is_full))
+        self._listeners[topic].append(listener)
 
     def has_room(self, topics: Iterable[str], ahead: bool) -> bool:
         """True if somebody can use a frame on these topics, or nobody of this process listens to frames there.
@@ -85,10 +87,12 @@ class Exchange:
         """True if a node of this process listens."""
         return bool(self._listeners.get(topic))
 
-    def publish(self, topic: str, message: Message) -> None:
-        """Hand a message to the listeners of this process."""
-        for listener in self._listeners.get(topic, ()):
-            listener.callback(message)
+    def publish(self, topic: str, message: Message) -> list[Callable[[], None]]:
+        """Hand a message to the listeners of this process; returns what awakens them."""
+        listeners = self._listeners.get(topic, ())
+        for listener in listeners:
+            listener.take(message)
+        return [listener.awaken for listener in listeners]
 
 
 class SharedMessage:

@@ -18,7 +18,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from slam_core.guarded_node import GuardedNode
 from slam_core.messages.base import Message
-from slam_core.nodes.exchange import Exchange
+from slam_core.nodes.exchange import Exchange, Listener
 from slam_core.nodes.input_config import MAX_WAITING_FRAMES, InputConfig
 from slam_core.nodes.job_queue import JobQueue, QueuedCall
 from slam_core.nodes.stamp_gaps import StampGaps
@@ -74,6 +74,7 @@ class ListeningNode(GuardedNode):
         self._jobs = JobQueue(self.input_config.policy, MAX_WAITING_FRAMES)
         self._inbox: deque[tuple[Input, Message]] = deque()
         self._topics_out: list[str] = []
+        self._to_awaken: dict[Callable[[], None], None] = {}
         self._at_work = False
         self._has_ended = False
         self._wake = self.create_guard_condition(self._guarded("inbox", self._empty_inbox))
@@ -121,6 +122,8 @@ class ListeningNode(GuardedNode):
         self._at_work = True
         done = self._jobs.run_some(frames=self._may_begin())
         self._at_work = False
+        self._awaken_listeners(self._to_awaken)
+        self._to_awaken.clear()
         if done:
             self._tell_of_room()
         return done
@@ -165,7 +168,8 @@ class ListeningNode(GuardedNode):
             return
         self._jobs.limit(entry.source, 1)  # others wait where they cost less, at the node that makes them
         is_full = partial(self._is_full, entry) if entry.policy is StampPolicy.FRAMES and not entry.latched else None
-        self._exchange.listen(entry.topic, lambda message: self._put_in_inbox(entry, message), is_full)
+        take = partial(self._put_in_inbox, entry)
+        self._exchange.listen(entry.topic, Listener(take, self._awaken, is_full))
 
     def _is_full(self, entry: Input, ahead: bool) -> bool:
         """True if a frame of an input waits, or, unless one is made ``ahead``, if the node has something else to do.
@@ -178,7 +182,17 @@ class ListeningNode(GuardedNode):
     def _put_in_inbox(self, entry: Input, message: Message) -> None:
         """Take a message from the thread of the node that made it."""
         self._inbox.append((entry, message))
-        self._awaken()
+
+    def _awaken_listeners(self, awaken: Iterable[Callable[[], None]]) -> None:
+        """Wake the nodes that messages of this one were handed to: each once, when all that belong together are made.
+
+        Each time would cost them a look at messages that lack their partners, and this node its turn.
+        """
+        if self._at_work:
+            self._to_awaken |= dict.fromkeys(awaken)
+        else:
+            for awaken_one in awaken:
+                awaken_one()
 
     def _awaken(self) -> None:
         """Have the node's thread look for work, if it waits for messages; it looks itself before it does."""
