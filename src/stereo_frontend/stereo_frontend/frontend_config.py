@@ -22,7 +22,7 @@ from stereo_frontend.stereo.self_calibration import SelfCalibrationConfig
 from stereo_frontend.surf.surf_device import CPU
 
 MODES = ("stereo", "tof", "replace", "fuse")
-_TRACKED = ("stereo",)
+_TRACKED = ("stereo", "replace", "fuse")
 """Modes in which features are followed by default."""
 
 

@@ -57,7 +57,7 @@ class FeatureConfig(Config):
     tracking: str = parameter(
         "auto",
         "follow features from frame to frame by their patches, and detect new ones only where these are few; "
-        "auto: in mode stereo",
+        "auto: in all modes but tof",
         choices=TRACKING,
     )
     device: str = parameter(
