@@ -59,7 +59,9 @@ def test_a_type_comes_back_from_its_text(value: object) -> None:
     assert listed._type_of(json.loads(json.dumps(listed._text_of(kind)))) == kind
 
 
-def test_listed_calls_are_compiled_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_listed_calls_are_compiled_and_kept_with_what_they_call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "some_kernels.py").write_text(KERNELS)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
@@ -67,8 +69,33 @@ def test_listed_calls_are_compiled_and_kept(tmp_path: Path, monkeypatch: pytest.
     call = [["float64", 1, "C", True]]
     assert listed.compile_listed(lambda: seen.append(None), {"some_kernels": {"longest": [call]}})
     assert len(seen) == 1
-    kept = {path.name.split("-")[0] for path in (tmp_path / "cache").rglob("*.nbc")}
-    assert kept == {"some_kernels.longest", "some_kernels.doubled"}
+    assert _kept(tmp_path) == {"some_kernels.longest"}
+    assert _called(tmp_path, "longest(x), longest.stats.cache_hits.total()") == "(4.0, 1)"
+    assert _called(tmp_path, "int(doubled(x).sum())") == "6"
+
+
+def test_listed_calls_are_compiled_with_what_the_cache_holds_already(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "some_kernels.py").write_text(KERNELS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    call = [["float64", 1, "C", True]]
+    for kernels in ({"doubled": [call]}, {"doubled": [call], "longest": [call]}):
+        assert listed.compile_listed(lambda: None, {"some_kernels": kernels})
+    assert _kept(tmp_path) == {"some_kernels.longest", "some_kernels.doubled"}
+    hits = "longest.stats.cache_hits.total(), doubled.stats.cache_hits.total()"
+    assert _called(tmp_path, f"longest(x), int(doubled(x).sum()), {hits}") == "(4.0, 6, 1, 1)"
+
+
+def _kept(folder: Path) -> set[str]:
+    return {path.name.split("-")[0] for path in (folder / "cache").rglob("*.nbc")}
+
+
+def _called(folder: Path, expression: str) -> str:
+    """What a new process prints for kernels called with [1, 2]."""
+    script = "import numpy as np\nfrom some_kernels import doubled, longest\nx = np.array([1.0, 2.0])\n"
+    script += f"print(({expression}))"
+    done = subprocess.run([sys.executable, "-c", script], cwd=folder, check=True, capture_output=True, text=True)
+    return done.stdout.strip()
 
 
 @pytest.mark.parametrize("calls", [{"none": [["int64"]]}, {"doubled": [["int64", "int64"]]}, {"doubled": [["int65"]]}])

@@ -2,7 +2,7 @@
 """Kernels compiled on all processors before anything is mapped, from a list of the arguments that they are called with.
 
 Numba compiles a kernel at its first call, one after the other. ``kernel_signatures.json`` holds the types of those
-calls, so that processes can share them; what else a kernel calls is compiled with it. An entry that fits no longer
+calls, so that processes can share them; what else a kernel calls is compiled into it. An entry that fits no longer
 costs time alone: the kernel is compiled at its first call, as without a list. ``slam warmup BAG --write`` writes it.
 """
 
@@ -23,6 +23,8 @@ from typing import Any
 
 from numba import types
 from numba.core.dispatcher import Dispatcher
+
+from slam_bringup.processes.inner_kernels import compile_in_full_only
 
 SIGNATURES = Path(__file__).with_name("kernel_signatures.json")
 """Module → kernel → calls, each the list of its arguments' types."""
@@ -49,7 +51,8 @@ def compile_listed(on_module: Callable[[], None], calls: Calls) -> bool:
     """
     count = max(1, int(min(len(os.sched_getaffinity(0)), len(calls), _memory_left() / _PROCESS_BYTES)))
     fits = True
-    with ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_ignore_interrupt) as pool:
+    names = {(module, name) for module, kernels in calls.items() for name in kernels}
+    with ProcessPoolExecutor(count, get_context("spawn"), _begin, (names,)) as pool:
         try:
             for fit in pool.map(_compile_module, calls.items()):
                 on_module()
@@ -63,9 +66,10 @@ def compile_listed(on_module: Callable[[], None], calls: Calls) -> bool:
     return fits
 
 
-def _ignore_interrupt() -> None:
-    """Leave Ctrl-C to the process that started this one."""
+def _begin(names: set[tuple[str, str]]) -> None:
+    """Prepare a process that compiles; it leaves Ctrl-C to the one that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    compile_in_full_only(names)
 
 
 def _memory_left(meminfo: Path = Path("/proc/meminfo"), group: Path = Path("/sys/fs/cgroup")) -> float:

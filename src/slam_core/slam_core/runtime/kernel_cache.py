@@ -40,9 +40,14 @@ _SYMBOL = np.dtype(
 _SYMBOL_TABLE = 2
 
 
+def is_known_numba() -> bool:
+    """True if this release of Numba is one whose inner workings are known here."""
+    return bool(numba.__version__.startswith(_KNOWN))
+
+
 def load_machine_code_alone() -> None:
     """Have kernels loaded so from now on, in this process; a second call, or another Numba, changes nothing."""
-    if numba.__version__.startswith(_KNOWN):
+    if is_known_numba():
         CPUCodeLibrary._unserialize = classmethod(_unserialize)  # type: ignore[method-assign,assignment]
         Cache.load_overload = _load_overload  # type: ignore[method-assign]
         environment._rebuild_env = _rebuild_environment  # type: ignore[assignment]
