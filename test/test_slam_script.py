@@ -116,6 +116,40 @@ def test_kernels_are_compiled_before_the_command_that_needs_them(clone: Clone, c
     assert "warmup" not in clone.calls
 
 
+def test_the_demo_does_without_what_other_commands_need(tmp_path: Path) -> None:
+    made = Clone(tmp_path)
+    assert made.slam("demo").returncode == 0
+    order = [made.calls.index(step) for step in ("-m pip install", "slam_bringup.cli warmup", "slam_bringup.cli demo")]
+    assert order == sorted(order)
+    assert made.calls.count("requirements-ros.txt") == 1
+    assert "compileall -qq -j 0" not in made.calls
+    assert not (made.root / "install").exists()
+    assert made.slam("doctor", "x").returncode == 0
+    assert "pip install" not in made.calls
+    assert "compileall -qq -j 0" in made.calls
+    assert (made.root / "install" / "setup.bash").exists()
+    assert made.slam("doctor", "x").returncode == 0
+    assert "compileall" not in made.calls
+
+
+def test_the_demo_is_that_of_this_clone_beside_another_workspace(tmp_path: Path) -> None:
+    made = Clone(tmp_path)
+    assert made.slam("demo", AMENT_PREFIX_PATH="/elsewhere/install").returncode == 0
+    assert (made.root / "install" / "setup.bash").exists()
+
+
+def test_packages_that_cannot_be_installed_end_it(tmp_path: Path) -> None:
+    made = Clone(tmp_path)
+    failing = PYTHON.replace(
+        "case", 'case "$*" in *"pip install"*ros.txt*) echo no such package; exit 1 ;; esac\ncase', 1
+    )
+    made.script("bin/python3", failing, rclpy=1)
+    result = made.slam("demo")
+    assert result.returncode == 2
+    assert "no such package" in result.stderr
+    assert not list(made.venv.glob(".stamp-packages*"))
+
+
 @pytest.mark.parametrize("arguments", [("run", "--help"), ("evaluate", "run", "nodes"), ("doctor", "x"), ("--help",)])
 def test_other_commands_do_not_wait_for_kernels(clone: Clone, arguments: tuple[str, ...]) -> None:
     clone.slam(*arguments)
