@@ -15,7 +15,7 @@ from ekf_slam_node.config import MAX_FRAME_FEATURES, MAX_UPDATE_LANDMARKS, STAND
 from ekf_slam_node.filtering.correlated_noise import CORRELATED_NOISE_FACTOR, CorrelatedNoise
 from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.filtering.noise_monitor import InnovationWatch, NoiseMonitor
-from ekf_slam_node.frame_association import FrameAssociation
+from ekf_slam_node.frame_association import MOVING, FrameAssociation
 from ekf_slam_node.loss_recovery import LossRecovery
 from ekf_slam_node.odometry.relative_poses import (
     ALL,
@@ -295,6 +295,9 @@ class EkfSlam:
         if found is None:
             return None
         link, expected = found.link, found.expected
+        if link.moving:
+            self.counters.add(f"frames_with_{MOVING}")
+            self.counters.add(f"features_on_{MOVING}", link.moving)
         known = None if aid is None else found.prior.T
         measured = self._noise.learn(frame, link.variance_scale)
         frame = self._shutter.corrected(measured, dt, link.T if known is None else known)

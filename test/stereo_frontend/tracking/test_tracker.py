@@ -142,11 +142,11 @@ def test_the_warp_of_a_patch_that_faces_the_camera_is_the_derivative_of_its_plac
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_stereo_is_tracked_by_itself_and_the_others_where_asked_for(mode):
+def test_all_modes_with_a_pair_are_tracked_by_themselves(mode):
     def tracks(tracking: str) -> bool:
         return from_mapping(FrontendConfig, {"mode": mode, "features.tracking": tracking}).tracks
 
-    assert [tracks(t) for t in TRACKING] == [mode == "stereo", True, False]
+    assert [tracks(t) for t in TRACKING] == [mode != "tof", True, False]
 
 
 def test_new_tracks_begin_where_there_are_none(stereo_pair, rng):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which frames map, and which tell the pose alone.
+"""Choice of the frames that map; those between them tell the pose alone.
 
 While nearly all that the last mapping frame showed is still in sight, a frame has little to add to the map: its
 features are followed, which tells where the rig is, and nothing is detected in it and no depth measured. So the cost of
