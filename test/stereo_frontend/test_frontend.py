@@ -144,6 +144,16 @@ def test_a_tof_camera_that_errs_by_an_offset_is_corrected_to_agree_with_stereo(s
     assert found["auto"][1] > found["off"][1]
 
 
+def test_a_tof_camera_that_errs_is_corrected_where_features_are_followed(stereo_pair):
+    front = frontend("fuse")
+    for disparity in np.arange(8.0, 14.0, 0.5):
+        pair, depth = stereo_pair(disparity=disparity), 200.0 * 0.12 / disparity
+        features = front.process(pair, tof_image(pair, depth=depth + 0.05), IDENTITY)
+    fused = features.source != FeatureSource.STEREO
+    assert front.report().ranges.get("corrected") == "yes"
+    assert np.abs(np.median(features.depth[fused]) - depth) < 0.01
+
+
 def test_how_old_a_depth_image_may_be_is_a_parameter(stereo_pair):
     pair = stereo_pair()
     for max_age, count in ((0.06, "tof_too_old"), (2.0, "fused")):

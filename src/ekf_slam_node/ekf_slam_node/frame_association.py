@@ -50,13 +50,14 @@ class FrameAssociation:
         prior = fused_prior(expected, aid)
         predicted = self.shutter.corrected(frame, dt, None if aid is None else prior.T)
         candidates = local.candidates()
-        link = self.linker.link(candidates, predicted, prior, partial(self._is_inconsistent, frame.stamp_ns), maps=maps)
+        is_refuted = partial(self._is_inconsistent, frame.stamp_ns, maps)
+        link = self.linker.link(candidates, predicted, prior, is_refuted, maps=maps)
         if link is not None:
-            link = self._without_moving(frame.stamp_ns, candidates, predicted, expected, link)
+            link = self._without_moving(frame.stamp_ns, candidates, predicted, expected, link, maps)
         return None if link is None else Associated(link, expected, prior)
 
     def _without_moving(
-        self, stamp_ns: int, candidates: Candidates, frame: Frame, expected: MotionPrior, link: FrameLink
+        self, stamp_ns: int, candidates: Candidates, frame: Frame, expected: MotionPrior, link: FrameLink, maps: bool
     ) -> FrameLink | None:
         """The link, or where the IMU contradicts it that of the features which agree with the IMU, if there are any.
 
@@ -73,16 +74,18 @@ class FrameAssociation:
             is_convincing = len(link.rows) >= CONVINCING * min(len(candidates), len(frame))
             if told.rows != ALL or is_convincing or self.aids.suspects_ride(told, link.T, dt):
                 return link
-            self.aids.add_inconsistency(stamp_ns)
-            self.counters.add("links_refuted")
+            if maps:
+                self.aids.add_inconsistency(stamp_ns)
+                self.counters.add("links_refuted")
             return None
         moving = np.setdiff1d(link.columns, other.columns)
-        self.linker.mark_moving(frame, moving)
+        if maps:
+            self.linker.mark_moving(frame, moving)
         return replace(other, moving=link.moving + len(moving))  # which the IMU is sure of
 
-    def _is_inconsistent(self, stamp_ns: int, link: FrameLink) -> bool:
+    def _is_inconsistent(self, stamp_ns: int, maps: bool, link: FrameLink) -> bool:
         """True if looks alone have led to a place where the IMU says that the rig cannot be."""
         if not self.aids.is_inconsistent(self.chain.stamp_ns, stamp_ns, link.T, link.covariance):
             return False
-        self.counters.add("links_refuted")
+        self.counters.add("links_refuted", int(maps))
         return True

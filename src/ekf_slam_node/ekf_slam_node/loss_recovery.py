@@ -65,12 +65,6 @@ class LossRecovery:
         reason = f"{len(frame)} features, fewer than {self.config.association.min_inliers} associations"
         return self.chain.result(frame.stamp_ns, TrackingState.LOST, reason)
 
-    def pass_over(self, frame: Frame) -> EkfResult:
-        """No link of a frame that maps nothing: the next one that maps decides what becomes of the map."""
-        self.counters.add("frames_lost")
-        reason = f"{len(frame)} features followed, fewer than {self.config.association.min_inliers} associations"
-        return self.chain.result(frame.stamp_ns, TrackingState.LOST, reason)
-
     def abandon(self, frame: Frame, reason: str, result: EkfResult | None = None) -> EkfResult:
         """Give up the open submap, which cannot be trusted any more, and begin a new one at this frame."""
         self.counters.add("submaps_abandoned")

@@ -54,6 +54,11 @@ class RideSubmaps:
         self.chain.is_held_open = rides.is_riding or rides.is_pending
         return result if submaps is result.submaps else replace(result, submaps=submaps)
 
+    def raised(self, pose: PoseEstimate) -> PoseEstimate:
+        """A pose since the last frame that maps, at the height that the cabin had there."""
+        height = self.aids.rides.height
+        return pose if height is None else self._raised(pose, height)
+
     def end_early(self) -> None:
         """Let the open submap end at the height of a cabin that has just arrived; a ride without end is none."""
         if self.aids.rides.is_riding:

@@ -24,6 +24,7 @@ from ekf_slam_node.odometry.relative_poses import (
     RelativePoseMeasurement,
     contradicts,
 )
+from ekf_slam_node.pose_only import PoseOnlyFrames
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.ride_submaps import RideSubmaps
 from ekf_slam_node.submaps.frame_input import LinkedCameras, frame_of_strongest, mounted, usable_features, without_tags
@@ -36,10 +37,13 @@ from ekf_slam_node.submaps.motion_checks import (
 )
 from ekf_slam_node.submaps.open_submap import LandmarkMatches
 from ekf_slam_node.submaps.rolling_shutter import RollingShutter
-from ekf_slam_node.submaps.steps import LinkedFrame, UpdatedFrame, sureness
+from ekf_slam_node.submaps.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submaps.submap_chain import SubmapChain
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
 from slam_core.types import Counters, Features, ImuSample, OdometryReading, PressureReading, RelativeMotion, Submap
+
+_PATIENCE_NS = 1_000_000_000
+"""Time after the end of a map for which a new one waits for a frame that maps."""
 
 
 class EkfSlam:
@@ -96,13 +100,14 @@ class EkfSlam:
         self._next_id = 0
         self._newest_stamp_ns = 0
         self._tags: Frame | None = None
-        self._located: Frame | None = None
         self._linked_cameras = LinkedCameras()
         self._standing = StandingDetector(STANDING_FRAMES, self.config.association.gate)
         missed = MissedFrames(self._linker, self._T_rig_optical, self.config.motion)
         known = self._chain, self._aids, self._linker, self._shutter
         self._association = FrameAssociation(self.config, *known, self.counters)
         self._rides = RideSubmaps(self._chain, self._aids, self.counters)
+        located = self._chain, self._association, self._aids, self._common, self._rides
+        self._pose_only = PoseOnlyFrames(*located, self.counters, self._map)
         self._recovery = LossRecovery(self.config, self._chain, self._aids, missed, self.counters, self._advance)
 
     # --------------------------------------------------------------------------------------------------------- input
@@ -124,10 +129,14 @@ class EkfSlam:
         self.counters.add("features_unusable", int(len(features) - usable.sum()))
         frame = self._noise.corrected(mounted(frame_of_strongest(features, usable, MAX_FRAME_FEATURES), *place))
         if not self._chain.is_open:
+            if features.is_pose_only and self._chain.has_begun and frame.stamp_ns - self._chain.stamp_ns < _PATIENCE_NS:
+                return self._chain.result(frame.stamp_ns, TrackingState.DEGRADED, "waits for a frame that maps")
             self._linked_cameras.take(frame)
             return self._recovery.begin(frame)
-        if features.is_pose_only:
-            return self._locate(frame)
+        return self._pose_only.locate(frame) if features.is_pose_only else self._map(frame)
+
+    def _map(self, frame: Frame) -> EkfResult:
+        """One frame of Algorithm 3, and what rides and failures make of it."""
         slips = self._aids.external.slips
         self._aids.rides.forget_events()
         try:
@@ -224,7 +233,7 @@ class EkfSlam:
 
         It ends where an odometry has carried the rig to, if the last frames had no link.
         """
-        before = self._advance_to_located() if self._chain.is_open else None
+        before = self._pose_only.advance() if self._chain.is_open else None
         self._recovery.end_where_odometry_is()
         self._rides.end_early()
         return (() if before is None else before.submaps) + self._chain.finish()
@@ -235,10 +244,10 @@ class EkfSlam:
         dt = seconds_between(self._chain.stamp_ns, frame.stamp_ns)
         aid = self._aids.between(self._chain.stamp_ns, frame.stamp_ns)
         linked = self._link(frame, dt, aid)
-        if linked is None and (before := self._advance_to_located()) is not None:
+        if linked is None and (before := self._pose_only.advance()) is not None:
             result = self._advance(frame)
             return replace(result, submaps=before.submaps + result.submaps)
-        self._located = None
+        self._pose_only.newest = None
         if linked is None and aid is not None and aid.rows == ALL and aid.source == "scans":
             return self._recovery.dead_reckon(frame, dt, aid)
         bridge = None
@@ -262,32 +271,6 @@ class EkfSlam:
         self._measure_tags(linked, updated)
         submaps = self._close(linked, seen, updated) if updated.closes else self._maintain(linked, updated)
         return self._chain.result(frame.stamp_ns, *updated.state(linked.link), submaps, updated)
-
-    def _locate(self, frame: Frame) -> EkfResult:
-        """Tell where the rig is by a frame that maps nothing: the filter stays at the last one that does.
-
-        The pose is that of the landmarks and of the last mapping frame's other features, as the filter's pose has them
-        around it.
-        """
-        dt = seconds_between(self._chain.stamp_ns, frame.stamp_ns)
-        aid = self._aids.between(self._chain.stamp_ns, frame.stamp_ns)
-        try:
-            found = self._association.of(frame, dt, aid, maps=False)
-        except np.linalg.LinAlgError:
-            found = None
-        if found is None:
-            return self._recovery.pass_over(frame)
-        covariance = found.link.covariance + np.diag(self._common.sigma(frame) ** 2)
-        pose = self._chain.add_located_pose(frame.stamp_ns, found.link.T, covariance)
-        self._located = frame
-        self.counters.add("frames_pose_only")
-        state, reason = sureness(found.link)
-        return self._chain.result(frame.stamp_ns, state, reason, pose=pose)
-
-    def _advance_to_located(self) -> EkfResult | None:
-        """Let the filter move to the last frame that told its pose alone, if there is one since it moved last."""
-        frame, self._located = self._located, None
-        return None if frame is None else self._advance(frame)
 
     def _link(self, frame: Frame, dt: float, aid: RelativePoseMeasurement | None) -> LinkedFrame | None:
         """Associate a frame with what is known, and learn its noise from the pairs; None if nothing fits."""

@@ -155,12 +155,13 @@ class Frontend:
         """Tracks that were followed into the pair; new keypoints, too, in a frame that maps and has few of them."""
         camera, sigma = images.stereo.camera, self._stereo_depth.noise.sigma
         tracks = tracker.follow(images.left, camera, images.stamp_ns, images.mask)
-        if tracks is not None and self._pace.is_pose_only(tracker, tracks, images.stamp_ns, camera):
-            self.counters.add("frames_pose_only")
-            return [pose_only(tracks, sigma)]
+        age_s = np.inf if depth is None else 1e-9 * abs(depth.stamp_ns - images.stamp_ns)
         parts: list[MeasuredKeypoints] = []
         if tracks is not None:
             self.pair_clock.move(images.stamp_ns, *tracker.motion)
+            if self._pace.is_pose_only(tracker, tracks, images.stamp_ns, camera, age_s):
+                self.counters.add("frames_pose_only")
+                return [pose_only(tracks, sigma)]
             stereo = self._stereo_depth.of_tracks(images, tracks)
             estimate = self._tof_depth.added_to(stereo, tracks.keypoints.uv, images, depth, T_left_tof)
             parts.append(followed(tracker, tracks, estimate, camera, sigma))
@@ -170,7 +171,7 @@ class Frontend:
             self.counters.add("key_frames")
             left, estimate = self._detected(images, self._extract(images), depth, T_left_tof)
             parts.append(begun(tracker, number, images.left, left, estimate, camera, sigma))
-        self._pace.mapped(images.stamp_ns, parts)
+        self._pace.mapped(images.stamp_ns, parts, age_s)
         return parts
 
     @property

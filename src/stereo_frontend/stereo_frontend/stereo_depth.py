@@ -150,11 +150,10 @@ class StereoDepth:
         self, images: StereoImages, uv: Float32Array, u_right: Float32Array, row_error: Float32Array
     ) -> RefinedDisparity:
         """Half of the matches on each of two threads."""
+        left, right = images.left, images.right  # made once, not by either thread
 
         def part(which: slice) -> RefinedDisparity:
-            return refine_disparity(
-                images.left, images.right, uv[which], u_right[which], self._config.disparity, row_error[which]
-            )
+            return refine_disparity(left, right, uv[which], u_right[which], self._config.disparity, row_error[which])
 
         half = len(uv) // 2
         later = self._pool.submit(part, slice(half, None))

@@ -34,10 +34,10 @@ def tracks(uv: np.ndarray, ids: np.ndarray, depth: float = 2.0) -> Followed:
     return Followed(np.arange(n), keypoints(uv), ids, np.ones((n, 2), np.float32), np.full(n, depth))
 
 
-def pace_after(uv: np.ndarray, ids: np.ndarray, interval_s: float = 0.2) -> MappingPace:
+def pace_after(uv: np.ndarray, ids: np.ndarray, interval_s: float = 0.2, age_s: float = np.inf) -> MappingPace:
     pace, n = MappingPace(interval_s), len(ids)
     estimate = DepthEstimate(np.full(n, 2.0), np.full(n, 0.1), np.zeros(n, np.uint8))
-    pace.mapped(1_000_000_000, [MeasuredKeypoints(keypoints(uv), estimate, np.ones((n, 2), np.float32), ids)])
+    pace.mapped(1_000_000_000, [MeasuredKeypoints(keypoints(uv), estimate, np.ones((n, 2), np.float32), ids)], age_s)
     return pace
 
 
@@ -68,3 +68,10 @@ def test_tracks_without_depth_and_missing_ones_do_not_count(rng):
     assert not pace.is_pose_only(Tracker(500), tracks(uv, ids), stamp, CAMERA), "the tracker wants a key frame"
     pace.reset()
     assert not pace.is_pose_only(Satisfied(150), tracks(uv, ids), stamp, CAMERA)
+
+
+def test_a_frame_with_a_fresher_depth_image_maps(rng):
+    uv, ids = rng.uniform(0, 400, (100, 2)), np.arange(1, 101, dtype=np.int32)
+    pace = pace_after(uv, ids, age_s=0.05)
+    for age_s, expected in ((0.05, True), (np.inf, True), (0.0, False)):
+        assert pace.is_pose_only(Satisfied(150), tracks(uv, ids), 1_050_000_000, CAMERA, age_s) is expected

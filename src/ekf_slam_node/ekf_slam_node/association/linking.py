@@ -158,7 +158,8 @@ class Linker:
         )  # fmt: skip
         if two is not None:
             rows, columns = two.rows, two.columns
-            self.mark_moving(frame, two.moving)
+            if maps:
+                self.mark_moving(frame, two.moving)
         followed = candidates.places(rows), frame.places(columns)
         initial = prior.T if two is None else two.T
         guess = guess_motion(*followed, self._T_rig_optical, rng, _TRACK_HYPOTHESES, config.gate, initial)

@@ -45,12 +45,12 @@ class SubmapBuilder:
     def add_pose(self, pose: PoseEstimate, standing: bool = False) -> None:
         """Add the filter's present pose to the path; one of a rig that stands does not make the submap older."""
         self._standing += standing
-        if self._bridged and self._bridged[-1].stamp_ns == pose.stamp_ns:
-            self._path += smoothed(self._bridged, pose)
-        self._bridged = []
-        self._path += self._located
-        self._located = []
         self._mapping += 1
+        between = {p.stamp_ns: p for p in self._located if p.stamp_ns < pose.stamp_ns}
+        if self._bridged and self._bridged[-1].stamp_ns == pose.stamp_ns:
+            between |= {p.stamp_ns: p for p in smoothed(self._bridged, pose)}
+        self._located, self._bridged = [], []
+        self._path += [between[stamp] for stamp in sorted(between)]
         self._path.append(pose)
 
     def add_located_pose(self, pose: PoseEstimate) -> None:
@@ -70,11 +70,17 @@ class SubmapBuilder:
         self._bridged.append(pose)
 
     def raise_path(self, heights: tuple[HeightAt, ...], up: UpDirection) -> None:
-        """Raise the poses at the stamps of a lift's way by its heights; ``up`` along the submap's axes."""
-        by_stamp = {at.stamp_ns: at for at in heights}
+        """Raise the poses of a lift's way by its heights, which are interpolated; ``up`` along the submap's axes."""
+        if not heights:
+            return
+        first, last = heights[0].stamp_ns, heights[-1].stamp_ns
+        since = [at.stamp_ns - first for at in heights]
         for number, pose in enumerate(self._path):
-            if (at := by_stamp.get(pose.stamp_ns)) is not None and number > 0:
-                self._path[number] = up.raised(pose, at.height, at.variance)
+            if number > 0 and first <= pose.stamp_ns <= last:
+                after = pose.stamp_ns - first
+                height = np.interp(after, since, [at.height for at in heights])
+                variance = np.interp(after, since, [at.variance for at in heights])
+                self._path[number] = up.raised(pose, float(height), float(variance))
 
     def replace_end(self, pose: PoseEstimate) -> None:
         """Replace the newest pose of the path."""

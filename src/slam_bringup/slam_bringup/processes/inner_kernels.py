@@ -28,7 +28,7 @@ _NOWHERE = 0
 
 
 def compile_in_full_only(names: Container[tuple[str, str]]) -> None:
-    """Make LLVM code alone of the kernels not in ``names`` (module, name), in this process, which must call none of them.
+    """Make LLVM code alone of kernels not in ``names`` (module, name), in this process, which must call none of them.
 
     Another Numba than those known compiles all in full, as it always does.
     """

@@ -20,18 +20,21 @@ _NEAR, _FAR = 0.5, 8.0
 def annotated_image(image: ByteArray, features: Features) -> ByteArray:
     """Colour picture (height, width, 3), BGR, of an image, grey or red first, and its features.
 
-    Stereo circles, ToF squares, fused both.
+    Stereo circles, ToF squares, fused both; dots of those that only a direction was measured of.
     """
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if image.ndim == 2 else cv2.COLOR_RGB2BGR)
     colours = _depth_colours(features.depth)
-    circles = (features.source != FeatureSource.TOF).tolist()
-    squares = (features.source != FeatureSource.STEREO).tolist()
+    is_dot = features.source == FeatureSource.PREDICTED
+    circles = ((features.source != FeatureSource.TOF) & ~is_dot).tolist()
+    squares = ((features.source != FeatureSource.STEREO) & ~is_dot).tolist()
     places = np.round(features.uv).astype(int).tolist()
     for (u, v), circle, square, colour in zip(places, circles, squares, colours, strict=True):
         if circle:
             cv2.circle(picture, (u, v), 4, colour, 1, cv2.LINE_AA)
         if square:
             cv2.rectangle(picture, (u - 4, v - 4), (u + 4, v + 4), colour, 1)
+        if not (circle or square):
+            cv2.circle(picture, (u, v), 2, colour, cv2.FILLED, cv2.LINE_AA)
     cv2.putText(picture, f"{len(features)} features", (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
     return np.asarray(picture)
 

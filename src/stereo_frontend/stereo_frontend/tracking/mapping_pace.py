@@ -21,6 +21,8 @@ _LEAST_KEPT = 0.85
 """Share of the tracks of the last mapping frame that are still followed, below which the next one maps."""
 _MOST_FLOW = 0.06
 """Median way of these tracks since then, as a share of the image's width, above which the next one maps."""
+_FRESHER_S = 5e-3
+"""By how much a depth image is fresher to be worth a frame that maps."""
 _TOLERANCE_S = 1e-3
 """Jitter of stamps."""
 
@@ -39,11 +41,20 @@ class MappingPace:
     def reset(self) -> None:
         """Forget the frames so far."""
         self._stamp_ns: int | None = None
+        self._age_s = np.inf
         self._ids: IdArray = np.zeros(0, np.int32)
         self._uv: Float32Array = np.zeros((0, 2), np.float32)
 
-    def is_pose_only(self, tracker: Tracker, tracks: Followed, stamp_ns: int, camera: Camera) -> bool:
-        """True if a frame in which these tracks were found need not map."""
+    def is_pose_only(
+        self, tracker: Tracker, tracks: Followed, stamp_ns: int, camera: Camera, age_s: float = np.inf
+    ) -> bool:
+        """True if a frame in which these tracks were found need not map.
+
+        ``age_s``: time between the frame and the depth image beside it, infinite without one. One that has a fresher
+        depth image than the last mapping frame had maps, so that slower depth cameras are not passed over.
+        """
+        if age_s < self._age_s - _FRESHER_S:
+            return False
         if self._stamp_ns is None or not 0.0 < 1e-9 * (stamp_ns - self._stamp_ns) < self._interval_s - _TOLERANCE_S:
             return False
         _, then, now = np.intersect1d(self._ids, tracks.ids, assume_unique=True, return_indices=True)
@@ -54,9 +65,9 @@ class MappingPace:
         flow = np.linalg.norm(tracks.keypoints.uv[now] - self._uv[then], axis=1)
         return float(np.median(flow)) < _MOST_FLOW * camera.width
 
-    def mapped(self, stamp_ns: int, parts: Sequence[MeasuredKeypoints]) -> None:
-        """Note a frame that maps, and its tracks with depth."""
-        self._stamp_ns = stamp_ns
+    def mapped(self, stamp_ns: int, parts: Sequence[MeasuredKeypoints], age_s: float = np.inf) -> None:
+        """Note a frame that maps, its tracks with depth, and the age of its depth image."""
+        self._stamp_ns, self._age_s = stamp_ns, age_s
         usable = [np.flatnonzero((p.track_ids > 0) & np.isfinite(p.estimate.depth)) for p in parts]
         self._ids = np.concatenate([p.track_ids[i] for p, i in zip(parts, usable, strict=True)])
         self._uv = np.concatenate([p.keypoints.uv[i] for p, i in zip(parts, usable, strict=True)])
