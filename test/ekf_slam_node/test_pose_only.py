@@ -163,19 +163,6 @@ def test_where_images_say_nothing_scans_tell_the_pose(rng: np.random.Generator) 
     assert np.linalg.norm(boxminus(poses[5], result.pose.T)[:3]) < 0.02
 
 
-def test_what_moves_in_them_is_not_remembered(rng: np.random.Generator) -> None:
-    """Things that go their own way in frames that tell the pose alone change no byte of the map."""
-    world, poses = room(rng), loop(240)[:30]
-    shifted = dataclasses.replace(world, points=world.points.copy())
-    shifted.points[: len(world.points) // 3] += np.array([0.0, 0.15, 0.1])
-    frames = [tracked(shifted if k % 3 == 2 else world, T, k, rng, k % 3 != 0) for k, T in enumerate(poses)]
-    results, between, _ = run(frames)
-    assert sum(r.state is TrackingState.LOST for r in results) == 0
-    _, alone, _ = run([frame for frame in frames if not frame.is_pose_only] + frames[-1:])
-    for one, other in zip(between, alone, strict=True):
-        np.testing.assert_array_equal(one.covariance, other.covariance)
-
-
 def test_frames_that_never_map_begin_a_map_in_the_end(rng: np.random.Generator) -> None:
     """If none that maps comes within half a second, frames elsewhere that link to each other do."""
     frames, _ = walk(rng, steps=4)

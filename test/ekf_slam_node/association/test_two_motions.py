@@ -15,7 +15,7 @@ from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.slam import EkfSlam
 from feature_world import PointWorld, room
 from slam_core.geometry import FloatArray, boxminus
-from slam_core.types import Features
+from slam_core.types import Features, FeatureSource
 
 _RATE, _FRAMES = 10, 60
 _STEP_NS = 1_000_000_000 // _RATE
@@ -109,3 +109,24 @@ def test_the_newest_tracks_are_remembered() -> None:
     assert tracks.marks(np.array([0, 3, 4, 5])).tolist() == [False, True, False, True]
     tracks.mark(np.arange(1000, 1500))
     assert tracks.marks(np.array([3, 1499])).tolist() == [False, True]
+
+
+def test_a_frame_that_tells_the_pose_alone_remembers_nobody() -> None:
+    """The map is to the byte the one without such frames, also where somebody walks in them."""
+    rng = np.random.default_rng(7)
+    world, companion, frames = room(rng, 700), Companion(60, rng), []
+    for k in range(_FRAMES):
+        T, stamp, maps = carried(k / _RATE), k * _STEP_NS, k % 2 == 0
+        seen = world if k < 20 else companion.beside(world, T, k)
+        features, index = seen.features(T, stamp, rng, noise=0.3, max_features=400)
+        features = followed(features, index)
+        source = np.full(len(features), FeatureSource.PREDICTED, np.uint8)
+        frames.append(features if maps else replace(features, sigma_depth=0.25 * features.depth, source=source))
+    maps = []
+    for chosen in (frames[:-1], frames[:-1:2]):
+        slam = EkfSlam(EkfSlamConfig())
+        results = [slam.process(features) for features in chosen]
+        assert slam.counters.counts["frames_with_moving_objects"] > 0
+        maps.append([s.covariance for r in results for s in r.submaps] + [s.covariance for s in slam.finish()])
+    for with_them, without in zip(*maps, strict=True):
+        np.testing.assert_array_equal(with_them, without)
