@@ -35,7 +35,8 @@ class DepthEstimate:
         """With predicted depths (n,) m where none is known, of a standard deviation given as a share of them."""
         missing = ~np.isfinite(self.depth)
         sigma = np.where(missing, relative_sigma * predicted, self.sigma)
-        return DepthEstimate(np.where(missing, predicted, self.depth), sigma, self.source)
+        source = np.where(missing, np.uint8(FeatureSource.PREDICTED), self.source)
+        return DepthEstimate(np.where(missing, predicted, self.depth), sigma, source)
 
     @staticmethod
     def unknown(n: int) -> DepthEstimate:

@@ -188,8 +188,11 @@ class FeatureStage:
         return self._with_tags(replace(features, frame_id=source.frame_id), images, depth)
 
     def _with_tags(self, features: Features, images: StereoImages | None, depth: DepthImage | None) -> Features:
-        """The features and the fiducial tags of the left image, or of a depth camera without one."""
-        if self._tags is None:
+        """The features and the fiducial tags of the left image, or of a depth camera without one.
+
+        Tags are landmarks: a frame that tells the pose alone measures none.
+        """
+        if self._tags is None or features.is_pose_only:
             return features
         if images is not None:
             return self._tags.with_tags(

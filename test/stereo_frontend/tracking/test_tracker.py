@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from slam_core.config import from_mapping
+from slam_core.frame_tree import FrameTree
 from slam_core.types import DepthImage, Features, FeatureSource, StereoImages
 from stereo_frontend.detection.features import TRACKING
+from stereo_frontend.fiducials.tag_features import TagFeatures
 from stereo_frontend.frontend import Frontend
 from stereo_frontend.frontend_config import MODES, FrontendConfig
+from stereo_frontend.stage import FeatureStage
 from stereo_frontend.tracking.frame_motion import facing_warp, fit_motion
 
 STEP_NS = 100_000_000
@@ -106,6 +109,8 @@ def test_a_track_without_depth_measures_its_direction(stereo_pair):
     assert min(len(blind), len(sighted)) > 20
     np.testing.assert_allclose(last.depth[blind], 2.0, atol=0.05)  # as the camera's motion predicts it
     np.testing.assert_allclose(last.sigma_depth[blind], 0.25 * last.depth[blind], rtol=1e-5)
+    assert (last.source[blind] == FeatureSource.PREDICTED).all()
+    assert (last.source[sighted] == FeatureSource.TOF).all()
     assert last.sigma_depth[sighted].max() < 0.01
     assert last.sigma_uv[blind].max() < 0.5
 
@@ -216,3 +221,15 @@ def test_every_second_frame_of_a_slow_camera_tells_the_pose_alone(stereo_pair):
 def test_all_frames_map_where_that_is_asked_for(stereo_pair, changed):
     frontend = Frontend(from_mapping(FrontendConfig, {"features.target": 300, **changed}))
     assert not any(f.is_pose_only for f in frames_of(frontend, stereo_pair, 3))
+
+
+def test_tags_are_not_searched_for_in_frames_that_tell_the_pose_alone(stereo_pair, monkeypatch):
+    wanted = {"features.mapping_interval": 0.2, "tags.dictionary": "apriltag_36h11"}
+    stage, searched = FeatureStage(from_mapping(FrontendConfig, wanted), FrameTree()), []
+    monkeypatch.setattr(TagFeatures, "of_pair", lambda _, images, *others: searched.append(images.stamp_ns) or [])
+    monkeypatch.setattr(TagFeatures, "with_tags", lambda _, features, tags: features)
+    for k in range(4):
+        stage.add_images(moved(stereo_pair(), k))
+    features = [stage.measure(frame) for frame in stage.extracted()]
+    assert [f.is_pose_only for f in features] == [False, True, False, True]
+    assert searched == [f.stamp_ns for f in features if not f.is_pose_only]

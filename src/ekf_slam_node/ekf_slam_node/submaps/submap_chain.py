@@ -124,8 +124,7 @@ class SubmapChain:
         """Add the pose after a motion from the filter's pose that no image confirms; returns it as T_odom_rig."""
         before = self.local.filter_pose(self.stamp_ns)
         self._builder.add_bridged_pose(BridgedPose(before, motion, stamp_ns))
-        drifted = compose_covariance(before.T, self.local.pose_covariance(), motion.T, motion.covariance)
-        return self._odometry.pose(stamp_ns, before.T @ motion.T, drifted)
+        return self._pose_after(stamp_ns, motion.T, motion.covariance)
 
     def add_located_pose(self, stamp_ns: int, motion: FloatArray, covariance: FloatArray) -> PoseEstimate:
         """Add the pose after a motion (4, 4) from the filter's pose, which a frame shows that maps nothing.
@@ -135,8 +134,13 @@ class SubmapChain:
         before = self.local.filter_pose(self.stamp_ns)
         T, own = before.T @ motion, compose_covariance(before.T, before.covariance, motion, covariance)
         self._builder.add_located_pose(PoseEstimate(stamp_ns, T, own))
-        drifted = compose_covariance(before.T, self.local.pose_covariance(), motion, covariance)
-        return self._odometry.pose(stamp_ns, T, drifted)
+        return self._pose_after(stamp_ns, motion, covariance)
+
+    def _pose_after(self, stamp_ns: int, motion: FloatArray, covariance: FloatArray) -> PoseEstimate:
+        """T_odom_rig after a motion (4, 4), of covariance (6, 6), from the filter's pose, drift included."""
+        T = self.local.T
+        drifted = compose_covariance(T, self.local.pose_covariance(), motion, covariance)
+        return self._odometry.pose(stamp_ns, T @ motion, drifted)
 
     def is_complete(self, shared: int) -> bool:
         """True if the submap ends with this frame, in which the next one would share so many landmarks with it."""

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from slam_core.camera import Camera
-from slam_core.types import ByteArray, FeatureSource, Float32Array
+from slam_core.types import ByteArray, Float32Array
 from stereo_frontend.assembly import DepthEstimate, MeasuredKeypoints
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.tracking.tracker import Followed, Tracker
@@ -37,15 +37,17 @@ def followed(
 ) -> MeasuredKeypoints:
     """Features of the ``tracks`` (n), which have the depths of ``estimate`` (n); the tracker learns these."""
     tracker.measured(tracks, estimate.depth, camera)
-    sigma = np.hypot(tracks.sigma_uv, _SHARE * noise(tracks.keypoints.size)[:, None])
-    return MeasuredKeypoints(tracks.keypoints, estimate, sigma.astype(np.float32), tracks.ids)
+    return _measured(tracks, estimate, noise)
 
 
 def pose_only(tracks: Followed, noise: Noise) -> MeasuredKeypoints:
     """Features of the ``tracks`` (n) of a frame in which no depth is measured: directions, with predicted depths."""
-    n, sigma = len(tracks.ids), np.hypot(tracks.sigma_uv, _SHARE * noise(tracks.keypoints.size)[:, None])
-    source = np.full(n, FeatureSource.PREDICTED, np.uint8)
-    estimate = DepthEstimate(tracks.depth, PREDICTED_SIGMA * tracks.depth, source)
+    estimate = DepthEstimate.unknown(len(tracks.ids)).completed(tracks.depth, PREDICTED_SIGMA)
+    return _measured(tracks, estimate, noise)
+
+
+def _measured(tracks: Followed, estimate: DepthEstimate, noise: Noise) -> MeasuredKeypoints:
+    sigma = np.hypot(tracks.sigma_uv, _SHARE * noise(tracks.keypoints.size)[:, None])
     return MeasuredKeypoints(tracks.keypoints, estimate, sigma.astype(np.float32), tracks.ids)
 
 
